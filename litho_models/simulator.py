@@ -27,7 +27,7 @@ def spot_um(pitch_um: float) -> float:
     """Return the spot size (standard deviation, µm) from which a model derives its default lengths, given the
     pixel pitch of the layouts.
 
-    The result is ``FIRST_SPOT_UM`` if this spot is between half a pixel and ten pixels wide. Otherwise the
+    The result is ``FIRST_SPOT_UM`` if this length is between half a pixel and ten pixels. Otherwise the
     layouts are taken to belong to another printer, whose spot is assumed to be two pixels wide.
     """
     low, high = _RESOLVED_PX
@@ -102,8 +102,8 @@ class Simulator(nn.Module, ABC):
     of shape (batch, 1, ny, nx), in µm.
 
     A subclass implements ``interior``. The height of a pixel may depend only on the layout within
-    ``reach_px`` pixels of it. If a part of the layout is cropped together with a margin of this width, the
-    heights of that part are the same as in the whole layout.
+    ``reach_px`` pixels of it. If a part of the layout is cut out with a margin of this width, the model
+    therefore predicts the same heights for this part as in the whole layout.
     """
 
     name: ClassVar[str]
@@ -117,7 +117,7 @@ class Simulator(nn.Module, ABC):
         self.config = config
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """Register a parameter. If the configuration lists it in ``fixed``, it is not trained."""
+        """Register a parameter. A parameter that the configuration lists in ``fixed`` is not trained."""
         known = self.ranges[name].name if name in self.ranges else name
         if param is not None and known in self.config.fixed:
             param.requires_grad_(False)

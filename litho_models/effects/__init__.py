@@ -1,5 +1,5 @@
-"""The catalogue of effects: named, differentiable changes of the layout or height that can be
-switched off.
+"""The catalogue of effects. An effect is a named, differentiable change of the layout or of the height. Every
+effect can be switched off.
 """
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, of_single_scans

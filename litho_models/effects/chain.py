@@ -14,8 +14,8 @@ from litho_models.simulator import Simulator, Tile
 
 # The frame of an effect: whether the effect rotates with the print or with the scan.
 Frame = Literal["scan", "print"]
-# Key of a cached field. It contains everything on which the field depends: the names, frames and parameter
-# values of the effects before it, and the base.
+# Key of a cached field. It contains everything on which the field depends: the base model, and the names,
+# frames and parameter values of the effects applied so far.
 Key = tuple[object, ...]
 Fields = MutableMapping[Key, Tensor]
 
@@ -66,8 +66,8 @@ class EffectChain(nn.Module):
         Args:
             context: facts about the scan to predict. The layout must then be a single one.
             known: cache of intermediate fields that this chain or other chains have already computed for the
-                same scan: the output of the base and that of each effect. Newly computed fields are added to
-                this cache.
+                same scan: the outputs of the base and of the effects. Newly computed fields are added to this
+                cache.
             base_key: value that identifies the base if chains with different bases share the cache ``known``.
         """
         if context is None and len(layout_um) > 1:

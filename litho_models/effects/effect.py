@@ -79,8 +79,8 @@ class FieldContext:
         order: position of this field in the writing order, scaled so that the dataset spans -0.5 to 0.5.
         scan_shape: numbers of rows and columns of the whole scan, if this field is only a part of a scan.
         origin_px: row and column of this field's first pixel in the whole scan.
-        quarter_turns: number of quarter turns by which the print was rotated under the microscope, with the
-            direction of rotation of ``torch.rot90``.
+        quarter_turns: number of quarter turns by which the print was rotated under the microscope, in the
+            direction of ``torch.rot90``.
         backward: whether the scan consists of retrace lines.
         new_tip: whether the scan was made with a new, sharp tip instead of the usual one.
         pixel_size: pixel size relative to that of the other scans. The time per pixel is the same in all
@@ -187,8 +187,9 @@ class Effect:
         title: short description for a process engineer.
         stage: stage of printing or measurement at which the effect acts.
         role: ``process`` if the printer causes the effect; ``measurement`` if the microscope causes it;
-            ``undetermined`` if it is not known which of the two causes it; ``nuisance`` if designs should not
-            depend on the effect. Only ``process`` effects become part of the exported process model.
+            ``undetermined`` if it is not known whether the printer or the microscope causes it; ``nuisance``
+            if designs should not depend on the effect. Only ``process`` effects become part of the exported
+            process model.
         acts_on: what the effect changes: ``layout``, the input of the base model, or ``height``, the output
             of the base model. Both are in µm.
         parameters: the parameters, keyed by name. At least one of them must be an amplitude.

@@ -91,8 +91,8 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     where H > H_s.
 
     The lost part has height z and shrinks as the remaining print does: z = z0 (1 - k (1 - u)). Here z0 is the
-    depth below the surface at which writing started, and u is the mean nominal height nearby as a fraction of
-    the full height.
+    depth at which writing started, measured from the surface of the substrate, and u is the mean nominal
+    height nearby as a fraction of the full height.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -131,7 +131,7 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
 )
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shorten every written line by δ at both ends (or lengthen it): M - δx |∂M/∂x| - δy |∂M/∂y|.
+    """Shorten every written line by δ at both ends (δ < 0 lengthens it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
     The formula gives the correct area that is lost at an edge, but not the correct shape of the edge. This
     does not matter, because the spot is wider than δ and determines the shape.

@@ -23,7 +23,7 @@ from litho_models.effects.filters import add_blur, add_warp
 from litho_models.models.parts import etch
 
 # ``_NORMAL_PX``: standard deviation of the blur that is applied before the normals of edges are computed.
-# ``_RIM_PX``: standard deviation of the blur that is applied before a sharp rim is located.
+# ``_RIM_PX``: standard deviation of the blur that is applied before a sharp edge is located.
 # ``_DIFFUSION_REACH_PX``: largest distance to which diffusion reaches.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 1.0, 1.6, 50.0
 # No point on a straight edge is farther than this from the nearest crossing of the edge with the grid of
@@ -70,8 +70,8 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     full = context.full_height_um
 
     def edged(variance_px2: Tensor) -> Tensor:
-        # A sharp rim does not show where within a pixel its edge lies. The film with diffusion and the film
-        # without it are therefore both slightly blurred.
+        # A sharp edge does not show where within a pixel it lies. The film is therefore slightly blurred in
+        # both cases, with and without diffusion.
         blurred = add_blur(height / full, variance_px2 + _RIM_PX**2, 1.0, _DIFFUSION_REACH_PX)
         return full * etch(functional.pad(blurred, (1,) * 4, mode="replicate"), 0.5, 0.0, 1.0)
 
@@ -128,20 +128,21 @@ FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
 
 def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
     """Move the edges of a film outwards along their normals. Films or gaps narrower than twice the shift
-    vanish. A film or gap narrower than twice ``_FLAT_PX`` that widens comes out up to 0.8 px too narrow, and
-    an edge that is softer than that moves too little.
+    vanish. If the shift widens a film or gap that was narrower than twice ``_FLAT_PX``, the result is up to
+    0.8 px too narrow. An edge moves too little if its transition extends farther than ``_FLAT_PX`` to each
+    side.
     """
     share = height[0, 0].detach() / context.full_height_um
     reach_px = float(outwards_px.detach().abs().max()) + _FLAT_PX + 1
     distance, normal = map(torch.from_numpy, _from_edge(share.double().cpu().numpy(), reach_px))
     distance, normal = distance.to(height), normal.to(height)
     wanted = distance + outwards_px
-    # Farther than ``_FLAT_PX`` from its edge, a film is flat. The value of such a pixel is looked up no
-    # farther away than necessary, because there may be another edge beyond.
+    # Farther than ``_FLAT_PX`` from its edge, a film is flat. Values are therefore looked up no farther from
+    # the edge than necessary, because another edge may lie farther away.
     most = torch.where(wanted * distance > 0, distance.abs().clamp(min=_FLAT_PX), _FLAT_PX)
     flat, farthest = (wanted.abs() - _FLAT_PX).clamp(0, 1), torch.sign(wanted) * most
-    # At zero shift, the lower and the upper limit are both reached. The derivative is then that of a shift
-    # outwards.
+    # Without a shift, every pixel farther than ``_FLAT_PX`` from its edge lies exactly on the lower or upper
+    # limit. The derivative at these pixels is taken for a shift outwards.
     nearer = wanted.clamp(min=-most)
     nearer = torch.where(nearer < most, nearer, most)
     inwards = nearer + flat * (farthest - nearer) - distance
@@ -169,7 +170,7 @@ def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
     index = nearest[near]
     away, along = pixels[near] - points[index], normals[index]
     inwards = (away * along).sum(-1)
-    # At a corner, the nearest point of the edge does not lie on the normal through the pixel.
+    # At a corner, the pixel does not lie on the normal through the nearest point of the edge.
     corner = np.linalg.norm(away - inwards[:, None] * along, axis=-1) > _BESIDE_PX
     signed = np.where(share[near] > 0.5, 1, -1) * away_px[near].clip(1e-9)
     distance[near] = np.where(corner, signed, inwards)

@@ -24,8 +24,8 @@ def add_filtered(
     pitch_um: float,
     reach_um: float,
 ) -> Tensor:
-    """Filter a field with a transfer function T. To do so, the field is filtered with T - 1, and the result
-    is added to the original field. If T = 1, the result is therefore exactly the field (bit for bit).
+    """Filter a field with a transfer function T. The field is filtered with T - 1, and the outcome is added
+    to the field. If T = 1, the field is therefore returned unchanged (bit for bit).
 
     Args:
         field: tensor of shape (b, 1, ny, nx).

@@ -1,5 +1,5 @@
-"""Laws: short formulas that describe how the height departs from the model. They depend on the height,
-slopes, surroundings, position in the scan or writing order.
+"""Laws: short formulas that describe how the height departs from the model. Each gives this departure as a
+function of the height, the slopes, the surroundings, the position in the scan or the writing order.
 
 A law is an effect with one strength (a wave has two) and fitted shapes, such as a power, a length, a
 direction or a position. It names no cause of the departure. Laws are screened, fitted, judged and applied by
@@ -74,7 +74,7 @@ class Surface:
     def place(self, word: str) -> Tensor:
         """Return a function of the position in the scan at each pixel. ``word`` is its name: ``x``, ``y``,
         ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of the pixel from the edge of
-        the scan.
+        the scan and ``length`` is a parameter of the law.
         """
         y, x = self.context.scan_position()
         if word == "rim":

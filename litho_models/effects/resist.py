@@ -106,11 +106,12 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink the tops of the print inwards more than the bases: H(r + s H(r) / full r), where r is measured
-    from the centre of the field.
+    """Shrink the tops of the print inwards more than the bases: H(r (1 + s H(r) / H_full)). Here r is the
+    position measured from the centre of the field, and H_full is the full height.
 
     The shrinkage at the mean height is a change of magnification, which registration removes. In a scan, the
-    point r = x / (1 + s mean / full) of the print therefore appears at position x.
+    point r = x / (1 + s H_mean / H_full) of the print therefore appears at position x, where H_mean is the
+    mean height.
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -150,8 +151,8 @@ def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Ten
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
     """Apply a morphological closing by a square to the height, which fills pits narrower than the square.
 
-    The square must be an odd number of pixels wide. For other widths, the result is interpolated between
-    those of the next narrower and the next wider square.
+    The square must be an odd number of pixels wide. For other widths, the result is interpolated between the
+    results of the next narrower and the next wider square.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
