@@ -28,7 +28,7 @@ class FlatLevel(Record):
     absolute value (``mae_nm``).
 
     The terms of the policy ``full+rows``, which include line offsets, are removed from each scan first.
-    ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm`` over prints.
+    ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm``, from resampling prints.
     """
 
     level: int
@@ -42,10 +42,10 @@ class FlatLevel(Record):
 class NoiseBudget(Record, extra="ignore"):
     """Two estimates of an upper limit of the noise of prints.
 
-    ``floor`` is the first estimate. ``flat_levels`` is the second; it covers the quarter of the pixels where
-    the layout is flattest. At these pixels, the slope of the layout is at most ``flat_slope``.
-    ``flat_texture`` is the texture of the residual at the same pixels. For the texture, only the terms of the
-    policy ``full`` are removed, so line offsets are part of it.
+    ``floor`` comes from pixels with similar surroundings (see ``estimated_floor``). ``flat_levels`` comes
+    from the quarter of the pixels where the layout is flattest, i.e. where its slope is at most
+    ``flat_slope``. ``flat_texture`` is the texture of the residual at these flattest pixels. Only the terms
+    of the policy ``full`` are removed before the texture is computed, so it still contains line offsets.
     """
 
     model: str
@@ -56,8 +56,8 @@ class NoiseBudget(Record, extra="ignore"):
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
-    """Compute the two upper estimates of the noise (see ``NoiseBudget``) from the residuals of one model on
-    held-out scans.
+    """Compute two estimates of an upper limit of the noise (see ``NoiseBudget``) from the residuals of one
+    model on held-out scans.
     """
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]

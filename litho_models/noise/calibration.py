@@ -48,7 +48,7 @@ _MEANS = ("nll", "crps_nm", "ence", "ause")
 class ScanCalibration(Record, extra="ignore"):
     """The calibration on one scan: the negative log-likelihood and the continuous ranked probability score
     (for both, lower is better), the share of residuals inside the stated intervals (coverage) for each of
-    ``Calibration.levels``, and the rms of the residual divided by its stated standard deviation.
+    ``Calibration.levels``, and the rms of the ratio of residual to stated standard deviation.
 
     ``ence`` and ``ause`` are fractions, for which 0 is best (see ``spread_scores``).
     """
@@ -91,8 +91,8 @@ class SigmaBin(Record, extra="ignore"):
     """The measured and the predicted spread of the residual, and the coverage of its intervals, for the
     pixels within one range of one covariate.
 
-    The coverages are those of the 68 % and 95 % intervals, each with its 95 % confidence interval over
-    prints. ``ence`` and ``ause`` are computed from the pixels in this range.
+    The coverages are those of the 68 % and 95 % intervals. Each coverage has a 95 % confidence interval from
+    resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.
     """
 
     covariate: str
@@ -284,7 +284,9 @@ def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[st
 
 
 def _sample(residual: Array, seed: int) -> tuple[Array, ...]:
-    """Return the row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels, drawn at random."""
+    """Return the row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels, which are chosen at
+    random.
+    """
     scored = np.flatnonzero(np.isfinite(residual))
     if scored.size > _PIXELS_PER_SCAN:
         scored = np.random.default_rng(seed).choice(scored, _PIXELS_PER_SCAN, replace=False)

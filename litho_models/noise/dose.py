@@ -20,12 +20,13 @@ from litho_models.scoring.like_layouts import blurred_layout_um
 # Pixels closer than this to a change of level are not used. The distance is about four standard deviations of
 # the optical spot, or two standard deviations of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
-# A step is lost if its height per level is less than this fraction of the median at the same dose.
+# A step is lost if its height per level is less than this fraction of the median height per level of all
+# steps at the same dose.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Distances over which the surroundings of a pixel are averaged. They exceed the distance to a change of level
-# above, because diffusion reaches up to 2.5 µm.
+# Distances over which the surroundings of a pixel are averaged. The larger distance exceeds ``_GUARD_UM``,
+# because diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
@@ -50,13 +51,14 @@ class DoseRow(Record, extra="ignore"):
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation of the height within areas of one level.
         lost_low: number of steps that are lost at the lowest levels, because under-exposed resist does not
-            remain. A step is lost if its height per level is less than half the median at this dose. It is
-            compared with the other steps at the same dose, so that shrinkage does not count as wrong
-            exposure.
+            remain. A step is lost if its height per level is less than half the median height per level of
+            all steps at this dose. The median is taken at the same dose, so that shrinkage does not count as
+            wrong exposure.
         lost_high: number of steps that are lost at the highest levels, because over-exposed resist cannot
             react any further.
-        worst_readability: smallest ratio of the height of a step to the standard deviation σ of its two
-            levels. If it is at least 3.92, single pixels of the two levels can be told apart.
+        worst_readability: smallest ratio of the height of a step to the standard deviation σ of single pixels
+            on its two levels. If this ratio is at least 3.92, single pixels of the two levels can be told
+            apart.
     """
 
     dose: float
@@ -82,12 +84,12 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Judge all doses that scans state. Return the dose matrix, and notes that say which doses are not
-    judged, and why. If too few doses can be judged, None takes the place of the matrix.
+    """Evaluate every dose that a scan states. Return the dose matrix, and notes that say which doses are not
+    evaluated, and why. If too few doses can be evaluated, None is returned instead of the matrix.
 
-    A dose is judged only if three levels have areas that are wide enough to measure. A matrix needs two such
-    doses. The recommended dose is the one whose heights are nearest to the nominal heights, among those doses
-    at which the fewest steps are lost.
+    A dose is evaluated only if three levels have areas that are wide enough to measure. A matrix needs at
+    least two such doses. The recommended dose is the one whose heights are nearest to the nominal heights,
+    among those doses at which the fewest steps are lost.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:
@@ -154,10 +156,10 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 
 def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], list[LevelHeight]]:
-    """Return the mean and the standard deviation of the height of each level, computed from pixels far from
-    every change of level, after the scans from which they are computed. Before that, the datum, the tilt and
-    the effect of the surrounding layout are removed from each scan. Scans that share no level with the others
-    are not used, because their datum is unknown.
+    """Return the scans that are used, and the mean and standard deviation of the height of each level. Only
+    pixels far from every change of level count. The datum, the tilt and the effect of the surrounding layout
+    are first removed from each scan. Scans that share no level with the others are not used, because their
+    datum is unknown.
     """
     found = [_level_parts(scan) for scan in scans]
     linked = _linked_levels(found)

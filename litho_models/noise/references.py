@@ -115,7 +115,7 @@ def _has_texture(one: Reference) -> bool:
 
 class RepeatedPrints(Record):
     """The noise of a single print, nm, from the differences between repeated prints of one layout. It
-    contains the noise of the print, of the microscope and, at edges, of the registration.
+    contains the contributions of printing, of the microscope and, at edges, of the registration.
 
     A polynomial of second degree is removed from the difference between two prints, so datum, tilt and bow
     are not included. Errors that repeat from print to print are not included either. ``ci95_nm`` is the 95 %
@@ -173,7 +173,8 @@ def _sigma_interval(squares_nm2: np.ndarray, prints: Sequence[tuple[str, str]]) 
 
     Pairs that share a print are not independent. Therefore prints are resampled, each with its jackknife
     pseudo-value: N times the mean over all pairs minus N - 1 times the mean over the pairs without this
-    print. For all pairs of N prints with white noise, it is the variance of the noise of this print.
+    print. If all pairs of the N prints are compared and the noise is white, the pseudo-value equals the
+    variance of the noise of this print.
     """
     names = list(dict.fromkeys(name for pair in prints for name in pair))
     without = np.array([[name not in pair for pair in prints] for name in names])
@@ -186,8 +187,8 @@ def _sigma_interval(squares_nm2: np.ndarray, prints: Sequence[tuple[str, str]]) 
 
 
 def _different_fields(first: PrintedScan, second: PrintedScan) -> bool:
-    """Return True if two scans show different printed fields: those of two prints, or two fields of one print
-    whose positions are both stated.
+    """Return True if two scans are known to show different printed fields: fields of two prints, or fields of
+    one print for which different positions are stated.
     """
     places = [(scan.field_x_um, scan.field_y_um) for scan in (first, second)]
     stated = all(None not in place for place in places)

@@ -29,7 +29,7 @@ class Residuals(NamedTuple):
     """The residuals of a model on each scan. A residual is the measured minus the predicted height.
 
     Attributes:
-        maps_um: height map that the model predicts for each scan, µm, with shape (ny, nx).
+        maps_um: height maps that the model predicts, µm, one of shape (ny, nx) for each scan.
         residuals_nm: residuals of each scan, nm, after the terms of ``protocol`` are removed, with shape (ny,
             nx). They are NaN at pixels that are not scored.
         held_out: True if none of the scans was used to train the model that predicts it.
@@ -58,8 +58,8 @@ class Pool(NamedTuple):
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
 
     def interval(self, values: Array, mine: Array) -> Interval:
-        """Return the confidence interval, over prints, of the mean of ``values`` at the pixels chosen by
-        ``mine``. Both arrays have shape (n,).
+        """Return the confidence interval, from resampling prints, of the mean of ``values`` at the pixels
+        where ``mine`` is True. Both arrays have shape (n,).
         """
         owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
         return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])

@@ -50,9 +50,9 @@ class Tails:
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Return the probability of values below z (the probability integral transform). Let z be the
-        residual divided by its scale. If both the scale and the distribution are right, this probability is
-        uniformly distributed over the pixels.
+        """Return the probability of values below z. For z, pass the residual divided by its scale; the result
+        is then the probability integral transform. If both the scale and the distribution are right, this
+        transform is uniformly distributed over the pixels.
         """
         return student.cdf(z, self.freedom)
 
@@ -64,7 +64,7 @@ class Tails:
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
         """Return, for each pixel, whether its residual lies within the central interval that has the
-        probability ``level``. If the spread is calibrated, the share of pixels for which it does is
+        probability ``level``. If the spread is calibrated, the share of residuals within their intervals is
         ``level``.
         """
         return np.abs(residual) <= self.half_width(level) * scale
@@ -115,8 +115,8 @@ def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
 
 
 def sparsification_error(residual: Array, sigma: Array) -> float:
-    """Return the area under the sparsification error (AUSE). It states how well σ ranks the pixels by their
-    error, with 0 for a perfect ranking.
+    """Return the area under the sparsification error (AUSE). The area states how well σ ranks the pixels by
+    their error; it is 0 for a perfect ranking.
 
     Pixels are removed in two orders: those with the largest σ first, and those with the largest absolute
     residual ``|r|`` first. For each order, the mean ``|r|`` of the remaining pixels is a function of the

@@ -33,8 +33,8 @@ class Step(Record, extra="ignore"):
     Args:
         readability: height of the step divided by ``sigma_nm``, the standard deviation of single pixels on
             its two treads.
-        misread: share of the pixels of the step's two treads whose height is nearer to that of the other
-            tread than to that of their own tread.
+        misread: share of the pixels on the step's two treads whose height is nearer to the height of the
+            other tread than to the height of their own tread.
     """
 
     height_nm: float
@@ -122,13 +122,13 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
     """Find the axis along which a staircase rises. Also return the indices of the pixels at which a new tread
     starts, in ascending order.
 
-    A piecewise-constant function is fitted to the profile of the staircase. The value of the profile at each
-    position is the median along the edges. The fit minimises the squared error plus a price for each edge.
-    The price is the amount by which an edge between two treads reduces the squared error if the treads have
-    the narrowest width and their heights differ by half a level.
+    A piecewise-constant function is fitted to the profile of the staircase. At each position along the axis,
+    the profile is the median of the heights along the line parallel to the edges. The fit minimises the
+    squared error plus a price for each edge. The price is the amount by which an edge between two treads
+    reduces the squared error if the treads have the narrowest width and their heights differ by half a level.
 
-    A tilt along the axis would add edges, so it is removed before. Columns or rows without a measured pixel
-    are skipped.
+    A tilt along the axis would add edges, so the tilt is removed first. Columns or rows without a measured
+    pixel are skipped.
 
     Raises:
         InputError: there is no edge along either axis.
@@ -183,10 +183,10 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float:
-    """Return the median slope of a profile between its edges, in µm per unit of ``position``. Edges that the
-    tilt itself adds do no harm, because the profile between them has the slope of the tilt. Only the middle
-    of each piece is used, because the blurred edges may reach far into a narrow tread. The result is 0 for a
-    profile of fewer than two pixels.
+    """Return the median slope of a profile between its edges, in µm per unit of ``position``. If a tilt of
+    the profile adds edges, they do no harm, because the profile between them still has the slope of the tilt.
+    Only the middle of each piece is used, because the blurred edges may reach far into a narrow tread. The
+    result is 0 for a profile of fewer than two pixels.
     """
     if len(profile) < 2:
         return 0.0
@@ -200,7 +200,7 @@ def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
     """Return the range of columns of each tread, without a zone of ``guard_px`` pixels along each of its two
-    edges. The zone is at most a third as wide as the tread.
+    edges. Each zone is at most a third as wide as the tread.
     """
     ends = pairwise([0, *edges_px, shape[1]])
     insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]

@@ -24,8 +24,8 @@ class Period(Record, extra="ignore"):
         share: fraction of the sum of squares of the line means that this period accounts for.
         p: probability that a smooth spectrum has a peak at least this high at any frequency.
         amplitude_nm: amplitude of the oscillation with this period, as root mean square over the surfaces.
-        coherence: 1 if the lines have the same phase on all surfaces, relative to the first pixel of each
-            array.
+        coherence: 1 if the lines have the same phase on all surfaces. The phase is counted from the first
+            pixel of each array.
     """
 
     period_um: float

@@ -20,8 +20,8 @@ from litho_models.scoring.like_layouts import blurred_layout_um
 # Names of the maps on which σ depends. The square of the slope and the fourth power of the radius are also
 # covariates.
 PLACES = ("level", "slope", "edge distance", "radius²")
-# The dependence on the level is linear between these knots. A single straight line would not do: the rare
-# levels at both ends are twice as rough as those in the middle.
+# The dependence on the level is linear between these knots. A single straight line would not fit, because the
+# rare levels at both ends are twice as rough as those in the middle.
 _LEVEL_KNOTS = np.linspace(0, 1, 7)
 COVARIATES = (
     *(f"level {share:.2f}" for share in _LEVEL_KNOTS),
@@ -50,9 +50,10 @@ class VarianceModel(Record):
     The covariates are:
 
     - the level, scaled to 0 ... 1, with a dependence that is linear between knots;
-    - the slope of the blurred layout (height over length);
+    - the slope of the blurred layout (height over length), and its square;
     - the distance to the nearest change of level, limited to 2 µm and divided by this limit;
-    - the distance from the centre of the field, divided by half the diagonal of the field.
+    - the second and the fourth power of r, the distance from the centre of the field divided by half the
+      diagonal of the field.
 
     ``freedom`` is the number of degrees of freedom of Student's t distribution, or None for a Gaussian.
     """
