@@ -37,9 +37,10 @@ MODELS: dict[str, type[Simulator]] = {
         *(Features, RandomFeatures, Physics, ElectronBeam, Projection, LaserWriter, DmdGrayscale, Pbl, Fno),
     )
 }
-# Side, in pixels, of the layout on which a registered model is tried. It is that of the crops of a training.
+# Side, in pixels, of the layout on which a registered model is tried. The crops on which models are trained
+# have the same side.
 _TRIAL_PX = 128
-# Maps the name of each registered model to the hashes of the sources of its class and of the base classes.
+# Maps the name of each registered model to the hashes of the source code of its class and base classes.
 _REGISTERED: dict[str, list[str]] = {}
 
 

@@ -19,9 +19,9 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
-# Below this value, the magnitude of a slope is smoothed, so that it has a derivative at 0. A slope here is
-# the height change over the distance σ, divided by the height of the highest level. The value corresponds to
-# a height change of about 2 nm.
+# Below this value, the magnitude of a slope is smoothed, so that the magnitude has a derivative at slope 0. A
+# slope here is the height change over the distance σ, divided by the height of the highest level. The value
+# corresponds to a height change of about 2 nm.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]

@@ -16,8 +16,8 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
-# Below this value, the magnitude of a slope is smoothed, so that it has a derivative at 0. A slope here is a
-# height change per µm, divided by the height of the highest level.
+# Below this value, the magnitude of a slope is smoothed, so that the magnitude has a derivative at slope 0. A
+# slope here is a height change per µm, divided by the height of the highest level.
 _LEAST_SLOPE = 1e-4
 
 
@@ -102,8 +102,8 @@ class Features(OfField, Simulator):
 
     - blurs, their cubes, and the products of any two blurs;
     - slopes along y and x at several blurs, with their magnitudes, products and second derivatives;
-    - displaced copies of the layout, one for each direction (up, down, left, right), and the magnitudes of
-      the height differences between the layout and these copies;
+    - copies of the layout that are displaced up, down, left and right, and the magnitudes of the height
+      differences between the layout and these copies;
     - blurs along one axis;
     - the steepness of the surroundings along each axis.
 

@@ -20,8 +20,8 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
-# Largest allowed number of Fourier weights. It prevents a model card from requesting too much memory, and is
-# ninety times the number in the paper.
+# Largest allowed number of Fourier weights. The limit prevents a model card from requesting too much memory,
+# and is ninety times the number in the paper.
 _MOST_MATRIX_ENTRIES = 30_000_000
 
 
@@ -33,8 +33,8 @@ class FnoConfig(SimulatorConfig):
     projection_channels: int = Field(
         128, ge=1, le=4096, description="number of hidden channels between the last two layers"
     )
-    # The paper uses 1 x 1. With this size, detail that is finer than the kept modes is mapped only pixel by
-    # pixel, without regard to its surroundings.
+    # The paper uses 1 x 1. A convolution of this size maps detail that is finer than the kept modes only
+    # pixel by pixel, without regard to its surroundings.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, px; must be odd")
     coordinates: bool = Field(False, description="whether y and x, scaled to 0 ... 1, are further inputs")
     padding_fraction: float = Field(

@@ -88,7 +88,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
     The result has shape (kernels, ny, nx).
 
     The points of the source lie on the grid of the field's frequencies. The weight of a point is the share of
-    its grid cell that the source fills.
+    its frequency cell that the source fills.
 
     Raises:
         InputError: the source is a ring too thin to fill any cell.

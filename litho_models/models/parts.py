@@ -44,7 +44,7 @@ class Number:
     Attributes:
         start: starting value; ``unit``: unit of the parameter, or ``1`` if it has none.
         lower, upper: range of the parameter. If ``upper`` is None, the upper limit of a length is five times
-            its starting value, and other parameters have none.
+            its starting value, and other parameters have no upper limit.
         fitted: whether the parameter is fitted; otherwise it keeps its value.
     """
 
@@ -66,7 +66,7 @@ class Part:
 
     Attributes:
         numbers: parameters of the part by name; ``source``: reference for the formula.
-        data_sha256: hash of the file from which the part was made, if there is one.
+        data_sha256: hash of the file from which the part was made; empty if there is no such file.
         apply: function with the arguments (field, values of the parameters, pitch in µm). It returns the next
             field.
     """

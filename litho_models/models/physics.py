@@ -93,15 +93,15 @@ class Physics(Simulator):
     """The Physics model: H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀). The shrinkage factor
     S depends on G_diffusion * Ĥ. M is the layout, H the printed height, g a gain and b a height bias.
 
-    In the variant ``default``, H₀ is the nominal height of the highest level, and the gain is fitted. Without
-    it, the highest level would always print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1.
-    If the threshold is below 0, it lies below the lowest level, and the projection uses only the concave part
-    of the tanh.
+    In the variant ``default``, H₀ is the nominal height of the highest level, and the gain is fitted. If the
+    gain were fixed at 1, the highest level would always print at H₀ + b. In ``paper`` and ``authors``, H₀ is
+    1 µm and g is 1. If the threshold is below 0, it lies below the lowest level, and the projection uses only
+    the concave part of the tanh.
 
-    The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
-    ``default`` scales it by a fixed range, ``paper`` by the range of the dose in the layout, and ``authors``
-    by the maximum of the dose in the layout. In ``paper`` and ``authors``, the height of a pixel therefore
-    changes if the layout is cropped differently.
+    The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The diffused
+    dose is scaled by a fixed range in the variant ``default``, by the range of the dose in the layout in
+    ``paper``, and by the maximum of the dose in the layout in ``authors``. In ``paper`` and ``authors``, the
+    height of a pixel therefore changes if the layout is cropped differently.
     """
 
     name = "physics"

@@ -56,7 +56,7 @@ class PrinterConfig(SimulatorConfig):
         return self
 
     def all_numbers(self) -> list[tuple[Part, str, Number]]:
-        """Return all parameters of all parts. Each comes with its part and with its name."""
+        """Return all parameters of all parts, each as a tuple of its part, its name and the parameter."""
         found = map(part_of, self.parts)
         return [(part, f"{part.name}.{key}", own) for part in found for key, own in part.numbers.items()]
 
@@ -102,8 +102,8 @@ class Printer(Simulator):
         return self.config.full_height_um * field
 
     def _chain(self) -> list[tuple[Part, dict[str, Any]]]:
-        """Return the parts in order. Each comes with the values of its parameters, keyed by name. Values that
-        are not fitted are Python numbers.
+        """Return the parts in order, each as a tuple of the part and the values of its parameters, keyed by
+        name. Values that are not fitted are Python numbers.
         """
         known = {**self.config.numbers, **self.values}
         found: dict[str, dict[str, Any]] = {name: {} for name in self.config.parts}
