@@ -1,5 +1,5 @@
 """The commands `litho-models board new` and `litho-models board judge`. The first makes stores with hidden
-causes, the second judges a loop on these stores.
+causes. The second runs a loop on these stores and scores the causes that the loop names.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def new(
     scans: Annotated[int, option("scans in each store", min=2)] = 12,
     size_px: Annotated[int, option("side of a layout, in pixels of 0.1 µm")] = 256,
 ) -> None:
-    """Simulate prints and scans with hidden causes in the virtual fab. A loop receives only the stores, and
-    the judge also the causes.
+    """Simulate prints and scans with hidden causes in the virtual fab. A loop under test receives only the
+    stores; ``board judge`` also reads the hidden causes.
 
     Example: litho-models board new --trials 8 --out board
     """
@@ -55,7 +55,8 @@ def judge(
         ),
     ] = None,
 ) -> None:
-    """Run a loop on every store of a board, and judge the causes that it names. An interrupted run resumes.
+    """Run a loop on every store of a board, and compare the causes that it names with the hidden causes. An
+    interrupted run resumes.
 
     Example: litho-models board judge board --loop "python my_loop.py" --out judged
     """

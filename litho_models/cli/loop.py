@@ -72,8 +72,8 @@ def close_loop(
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
-    """Find the effects in measured prints that a model lacks, add them to the model, and report its error on
-    held-out scans in nm.
+    """Find effects that occur in measured prints but not in a model, and add them to the model. Report the
+    error of this corrected model on held-out scans, in nm.
 
     Example: litho-models close-loop prints.zarr --out loop
     """

@@ -29,8 +29,8 @@ _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
-# Rule for the radius of a kernel: four sigma or three times sigma after sigma is rounded down to whole
-# pixels, as in the code of the paper's authors.
+# Rule for the radius of a kernel: either four sigma, or three times the value of sigma that is rounded down
+# to whole pixels. The latter is the rule in the code of the paper's authors.
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
@@ -89,7 +89,8 @@ def gaussian_blur(
             if _differentiated(sigma_px):
                 blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
             else:
-                # In a small field, what a derivative needs would take twice as long as the blur.
+                # Without derivatives, the band matrix is cached. In a small field, keeping track of
+                # derivatives would take twice as long as the blur itself.
                 band = _known_band(radius, float(sigma_px), sigma_px.dtype, sigma_px.device)
                 blurred = _Blur.forward(images, band, axis)
             field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
@@ -190,9 +191,9 @@ class _Blur(torch.autograd.Function):
 
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """Return the windows that the blocks of each sample need. A window is a block with the radius of the
-    kernel added on both sides, so neighbouring windows overlap. The function returns one tensor per sample.
-    It is a view of shape (blocks, length of the other axis, window).
+    """Return the windows that the blocks of each sample need. A window is a block extended on both sides by
+    the radius of the kernel, so neighbouring windows overlap. The function returns one tensor per sample,
+    which is a view of shape (blocks, length of the other axis, window).
 
     The samples are kept apart, because a single matrix product over several samples would copy the windows.
     """
@@ -208,7 +209,9 @@ def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
 
 
 def _differentiated(number: Tensor) -> bool:
-    """Return whether operations are recorded for derivatives, or whether ``number`` has no single value."""
+    """Return True if operations are recorded for derivatives, or if ``number`` is wrapped by ``torch.func``
+    and therefore has no single value.
+    """
     forward_mode = torch.autograd.forward_ad._current_level >= 0
     return torch.is_grad_enabled() or forward_mode or is_functorch_wrapped_tensor(number)
 

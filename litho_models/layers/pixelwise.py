@@ -40,8 +40,8 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
 
 
 class _WithSlopes(torch.autograd.Function):
-    """An operation that computes the values of a function together with their derivatives with respect to the
-    features (slopes). Only the slopes are kept for the backward pass.
+    """An operation that computes the values of a function and their slopes, i.e. their derivatives with
+    respect to the features. Only the slopes are kept for the backward pass.
 
     The slopes take as much memory as the features, but the backward pass need not evaluate the function
     again.
@@ -94,8 +94,7 @@ class PointwiseNet(nn.Module):
     convolutions).
 
     The network is a piecewise-linear function of one variable. It is therefore not evaluated at every pixel,
-    but only at about a thousand points (knots), whose number is ``knots``. Between these points, its values
-    are interpolated.
+    but only at ``knots`` points (about a thousand). Between these points, its values are interpolated.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):

@@ -62,8 +62,8 @@ class Range:
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """Return the bound on which the value of this raw number lies. Return None if it lies on neither
-        bound.
+        """Return the bound on which the value that corresponds to a raw number lies. Return None if this
+        value lies on neither bound.
         """
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
