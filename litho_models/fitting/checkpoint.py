@@ -46,7 +46,7 @@ class TrainingState:
 
     def record(self, record: RoundRecord) -> None:
         """Add the record of a round. The present weights become the best weights if this round has the
-        smallest validation error so far, or if there are no validation errors.
+        smallest validation error so far, or if there are no validation scans.
         """
         errors = [entry.validation_mae_datum_free_nm for entry in self.history]
         error = record.validation_mae_datum_free_nm

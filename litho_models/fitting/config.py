@@ -72,13 +72,14 @@ class TrainingConfig(Record):
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, *, film: bool = False, **settings: Any) -> Self:
         """Return the settings that a named recipe has for a model. Values in ``settings`` replace individual
-        values of the recipe. No terms are fitted to scans of a film, unless ``settings`` say so.
+        values of the recipe. If ``film`` is True, no terms are fitted to the scans, unless ``settings`` names
+        a policy.
 
         The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
         of 72 quadrants. It uses the learning rates of the paper and fits no per-scan terms. The recipe
         ``fast`` uses AdamW with a one-cycle schedule and random crops, and fits per-scan terms together with
-        the model. Its numbers of steps for each model are in ``FAST_STEPS``, and its settings for the default
-        PBL model are in ``FAST_CHAIN``.
+        the model. ``FAST_STEPS`` contains the number of steps of ``fast`` for some models, and ``FAST_CHAIN``
+        contains the settings of ``fast`` for the default PBL model.
 
         Raises:
             InputError: the recipe is unknown.

@@ -15,13 +15,14 @@ from litho_models.fitting.config import TrainingConfig
 # Largest number of pixels that the network processes at once. To compute its gradient, a network stores
 # hundreds of bytes per pixel.
 _PASS_PX = 256**2
-# A scan, or the part of it that is fitted, with fewer measured pixels says too little.
+# Smallest number of measured pixels that is enough for a fit, in a scan or in the part of a scan that is
+# fitted.
 FEWEST_PIXELS = 1024
 
 
 def part_to_fit(counts: Sequence[int], usual: int) -> int:
-    """Return the number of the part of a scan to fit: the usual part, or the one with the most measured
-    pixels if the usual part has few. ``counts`` contains the number of measured pixels of each part.
+    """Return the index of the part of a scan to fit: ``usual``, or the part with the most measured pixels if
+    the usual part has too few. ``counts`` contains the number of measured pixels of each part.
     """
     enough = counts[usual] >= min(FEWEST_PIXELS, max(counts))
     return usual if enough else int(np.argmax(counts))
@@ -62,9 +63,9 @@ def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: in
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """Choose the windows of one optimiser step. For given scan shapes and settings, the windows depend only
-    on the seed and the number of the step. A run that was interrupted and resumed therefore gives the same
-    result.
+    """Choose the windows of one optimiser step. For given scan shapes and settings (which include the seed),
+    this choice depends only on the number of the step. A run that was interrupted and resumed therefore gives
+    the same result.
     """
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)

@@ -121,8 +121,7 @@ def fit_in_cache(
     """Fit a model as ``fit`` does. Checkpoints are kept in a folder inside ``cache``, whose name contains the
     key of the fit (see ``run_key``).
 
-    If a benchmark and a closed loop train the same model on the same scans, the training is therefore done
-    only once.
+    A benchmark and a closed loop that train the same model on the same scans therefore train it only once.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"

@@ -1,10 +1,10 @@
 """Fit small models by a damped Gauss-Newton method. The terms of each scan are solved for together with the
 parameters of the model.
 
-The loss is a sum of squared or of absolute residuals r. Absolute residuals are minimised as squares that have
-the weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals of a model and their derivatives. It also
-provides the ``room``, i.e. the smallest and the largest allowed step of each parameter. The fitted model is a
-process model, or the base model of the closed loop together with its effects.
+The loss is a sum of squared or of absolute residuals r. To minimise absolute residuals, squared residuals are
+minimised with the weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals of a model and their
+derivatives. It also provides the ``room``, i.e. the smallest and the largest allowed step of each parameter.
+The fitted model is a process model, or the base model of the closed loop together with its effects.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ class LeastSquaresFit:
 def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
-    """Fit the parameters of a problem, beginning at the vector ``start``, whose dtype is kept. ``shown`` may
-    wrap the range of the step numbers to show progress.
+    """Fit the parameters of a problem, beginning at the vector ``start``. The fitted parameters have the
+    dtype of ``start``. ``shown`` may wrap the range of the step numbers to show progress.
     """
     vector, linear = start, problem.linearise(start)
     if not len(start):
@@ -157,8 +157,8 @@ def fit_least_squares(
 @dataclass(frozen=True)
 class NormalEquations:
     """The normal equations of one step. The first ``count`` rows belong to the parameters, and the next rows
-    to the terms of the scans. The last rows are the conditions that hold the mean of each pinned term (see
-    ``Rules``) over the scans at zero.
+    to the terms of the scans. The last rows are conditions: for each pinned term (see ``Rules``), the mean
+    over the scans is zero.
 
     With the loss ``squares``, the terms of the scans are eliminated beforehand, so the equations contain only
     the rows of the parameters.
@@ -172,7 +172,7 @@ class NormalEquations:
 
     @classmethod
     def at(cls, linear: Sequence[Linearised], terms: Array | None, rules: Rules) -> NormalEquations:
-        """Set up the equations from the linearised scans and the present values of the scans' terms.
+        """Set up the equations from the linearised scans and the present values of the per-scan terms.
         ``terms`` has shape (scans, k); with the loss ``squares`` it is None.
         """
         count = len(linear[0].jacobian)
@@ -209,8 +209,8 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # The terms are computed again for the limited step, because the terms found together with the
-        # unlimited step do not match it.
+        # The change of the terms is computed again for the limited step, because the change found together
+        # with the unlimited step does not match the limited step.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:

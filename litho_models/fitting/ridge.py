@@ -28,7 +28,7 @@ FITTED_PX = 16_384
 TILE_PX = 512
 KEPT_BYTES = 2**31
 # The first pass minimises squared residuals. The second pass reweights the pixels so that absolute residuals
-# are minimised. Dirt on a print then has little influence.
+# are minimised, which reduces the influence of dirt on a print.
 PASSES = 2
 # Weight of the part of a residual that the per-scan terms can explain. With this small weight, this part
 # still determines the datum that all scans have in common.

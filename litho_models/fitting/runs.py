@@ -156,7 +156,7 @@ def training_config(
 
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return, for each level, the share of the pixels of all scans that are printed with this level."""
+    """Return, for each level, the share of pixels, over all scans, at which the layout has this level."""
     levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
     return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
 

@@ -20,8 +20,8 @@ from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
 # A window with this side length, placed in one corner of each scan, contains enough pixels to fit a small
-# model. Successive scans use different corners. A corner with few measured pixels is replaced by the one that
-# has most.
+# model. Successive scans use different corners. If a corner has few measured pixels, the corner with the most
+# measured pixels is used instead.
 WINDOW_PX = 256
 THINNING_PX = 2
 # Largest step of a parameter. Its unit is µm for a height, and 1 for a raw number (see ``layers.ranges``).

@@ -4,8 +4,8 @@ Before each round, the per-scan terms are estimated from predictions of whole sc
 measured heights, which are then the targets of the round. After each round, the validation scans are scored
 and a checkpoint is written. Random choices depend only on the seed and the step, so an interrupted and
 continued run gives the same result as an uninterrupted one. If there are several processes, they divide the
-crops of each step among themselves and add up their gradients. Everything between two rounds is computed by
-every process in the same way.
+crops of each step among themselves and add up their gradients. The computations between two rounds are not
+divided: every process repeats them.
 """
 
 import math
@@ -50,8 +50,8 @@ def train_network(
 
     The best round is the one with the smallest error on the ``validation`` scans, or the last round if there
     are none. ``first_predictions_um`` returns the heights, µm, that a small model predicts for the training
-    scans; the per-scan terms of the first round are estimated from them. This function is not called if an
-    interrupted run continues after its first round.
+    scans; the per-scan terms of the first round are estimated from them. ``first_predictions_um`` is not
+    called if an interrupted run continues after its first round.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -79,7 +79,7 @@ def train_network(
             for step in progress(range(first, last), what, estimate_of=left):
                 sums.append(_step(state, targets, config, step, device))
         absolute, counted = torch.stack(sums).cpu().double().numpy().T
-        # A step says nothing about the error if its crops contain no measured pixel.
+        # A step whose crops contain no measured pixel does not count in the mean error of the round.
         seen = counted > 0
         if not seen.any():
             raise InputError(
@@ -127,8 +127,8 @@ def _diverged(model: Simulator, step: int) -> InputError:
 
 
 class _Targets:
-    """What the model learns in one round: the layouts of the training scans, their measured heights without
-    the per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
+    """The training data of one round: the layouts of the training scans, their measured heights without the
+    per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
 
     Each layout is extended by ``overhang_px`` pixels on each side, where its outermost pixels are repeated.
     The added pixels also have weight zero.
@@ -228,8 +228,9 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Return the learning rate of one step. With the schedule ``constant`` it is always the same. With
-    ``one-cycle`` it rises along a cosine during the first tenth of the steps and then falls along a cosine.
+    """Return the learning rate of one step. With the schedule ``constant``, the rate is always the same. With
+    ``one-cycle``, the rate rises along a cosine during the first tenth of the steps and then falls along a
+    cosine.
     """
     if config.schedule == "constant":
         return config.learning_rate

@@ -34,7 +34,7 @@ class CardMetric(Record):
     """One reported error or other value. ``split``, ``policy`` and ``background`` say on which scans it was
     computed, with which nuisance terms fitted and with which background added.
 
-    ``ci95`` is the 95 % confidence interval over scans.
+    ``ci95`` is the 95 % confidence interval of the value, from resampling scans.
     """
 
     name: str

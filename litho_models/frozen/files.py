@@ -50,7 +50,7 @@ def save_frozen(
         simulator: the fitted model.
         folder: output folder. If the folder contains an older frozen model, the older model is replaced
             completely.
-        name: name of the frozen model in reports; by default, the name of its class of model.
+        name: name of the frozen model in reports; by default, the name of the simulator.
         process_effects: effects of the printer that become part of the frozen model. The mapping contains the
             parameter values of each effect by name.
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …). Fields that
@@ -92,8 +92,8 @@ def save_frozen(
 def load_frozen(
     source: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
 ) -> FrozenSimulator:
-    """Load a frozen model together with its printer effects. The model is in eval mode, and its weights have
-    no gradients.
+    """Load a frozen model together with the printer effects that it contains. The model is in eval mode, and
+    no gradients are computed for its weights.
 
     Args:
         source: a folder that ``save_frozen`` wrote, ``zoo:NAME`` for a model of the package, or
@@ -193,8 +193,8 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     try:
         return known(config)
     except (ArithmeticError, ValueError) as error:
-        # Each value of the card is inside its own range, but some values contradict each other. For example,
-        # a starting value may exceed the upper bound.
+        # Each value of the card is inside its own range, but the values may contradict each other. For
+        # example, a starting value may exceed the upper bound.
         raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
 
 

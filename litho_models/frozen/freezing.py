@@ -77,7 +77,8 @@ def freeze(
     if not taken and printer is not simulator:
         simulator = printer
         kept["limitations"] = [*card.limitations, _WITHOUT_IT]
-        # Background and baseline compare the training scans with what the whole model predicted for them.
+        # The background and the baseline were computed from the predictions of the whole model for the
+        # training scans.
         del kept["background"], kept["baseline"]
     save_frozen(simulator, out, name=card.name, process_effects=sides["printer"], **kept)
     return ModelCard.read(Path(out) / CARD_FILE)

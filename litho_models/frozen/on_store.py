@@ -26,8 +26,8 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     Args:
         layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. The file contains the level
             number of each pixel, or grey values that represent level numbers. A file that ``litho-design``
-            exported is also accepted. The file that ``litho-design`` wrote beside it states the pitch and the
-            level height; both are checked.
+            exported is also accepted. The pitch and the level height of such an export are in a second file
+            that ``litho-design`` wrote beside the first; both values are checked.
         out: file for the height: ``.gsf`` (opens in Gwyddion) or ``.npy``.
 
     Raises:
@@ -87,8 +87,8 @@ def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """Return the ids of the scans in a store that were locked when the model was trained. The scans are
     recognised by their raw files.
 
-    Raw files are compared because they stay the same if the store is built anew. Heights and lock boxes do
-    not: other settings for levelling or registration change every height in the store, and an added or
+    Raw files are compared because they stay the same if the store is built anew. Heights and lock boxes may
+    change: other settings for levelling or registration change every height in the store, and an added or
     missing scan changes which scans the store locks. If the card lists no raw files, the ids of the locked
     scans that it names are returned instead, but only if the dataset has the same name.
     """

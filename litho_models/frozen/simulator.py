@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
     from litho_models.effects.chain import EffectChain
 
-# Tolerance of the calibrated range. Rounding to float32 may put the highest level slightly beyond the range.
-# The next level would exceed the range by a whole level height (100 nm in the first prints), which is far
-# more than this tolerance.
+# Tolerance of the calibrated range. Rounding to float32 may put the highest calibrated level slightly beyond
+# the range. A layout with one more level would exceed the range by a whole level height (100 nm in the first
+# prints), which is far more than this tolerance.
 _ROUNDING_UM = 1e-5
 # Width of the border of level 0 around an element, for a model whose prints depend on the whole layout.
 _WIDEST_GUARD_UM = 6.4
@@ -68,11 +68,11 @@ class FrozenSimulator(nn.Module):
 
     @property
     def guard_px(self) -> int:
-        """Return the width, in pixels, of the border of level 0 that an element that stands alone on the
-        substrate needs, because a model assumes that a layout continues beyond its edge.
+        """Return the width, in pixels, of the border of level 0 to add around an element that stands alone on
+        the substrate. The border is needed because a model assumes that a layout continues beyond its edge.
         """
         width_um = _WIDEST_GUARD_UM if self.reach_um is None else self.reach_um
-        # A reach is a whole number of pixels wide, up to rounding.
+        # A receptive radius is a whole number of pixels, apart from rounding errors.
         return math.ceil(width_um / self.pitch_um - 1e-6)
 
     @property
@@ -128,7 +128,7 @@ class FrozenSimulator(nn.Module):
         Args:
             layout_um: nominal height, µm, of any float type and of shape (..., ny, nx): a NumPy array, an
                 xarray array, or a tensor. If an xarray array has the coordinates y_um and x_um, they are
-                checked against the pitch. If it is a tensor, gradients flow to it.
+                checked against the pitch. If the layout is a tensor, gradients flow to it.
             pitch_um: sampling of the layout; it is checked if given.
 
         Raises:

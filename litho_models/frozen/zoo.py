@@ -49,7 +49,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
         other: further names that the caller accepts. They are only listed in the error message.
 
     Raises:
-        InputError: there is no such folder or model in the zoo, or the model cannot be downloaded.
+        InputError: there is no such folder, the zoo has no such model, or the model cannot be downloaded.
     """
     text = str(source)
     if text.startswith(hub.ADDRESS):
