@@ -1,9 +1,9 @@
 """Test whether the mean of a monitored quantity has changed since the reference prints, at a given rate of
 false alarms.
 
-The test makes one comparison for each new print. This comparison assumes that the mean changes in a step at
-this print and stays changed until the last print. The values before the step, which include those of the
-reference prints, are compared with the values after it by a t test with a pooled spread. Student's t
+The test makes one comparison for each new print. The comparison for a print assumes that the mean changes in
+a step at this print and stays changed until the last print. The values before the step, which include those
+of the reference prints, are compared with the values after it by a t test with a pooled spread. Student's t
 distribution holds for any number of reference prints, although their mean and spread are unknown. This is the
 likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
 Technology 35, 355). The rate of false alarms is divided among the comparisons (Bonferroni). It therefore
@@ -63,8 +63,8 @@ class Step(NamedTuple):
 
 
 def shares(new_prints: int) -> Array:
-    """Return the share of the rate of false alarms that each comparison gets, with shape (m,). There is one
-    comparison for each of the m new prints, in printing order. The shares add up to 1.
+    """Return the share of the rate of false alarms that is allotted to each comparison, with shape (m,).
+    There is one comparison for each of the m new prints, in printing order. The shares add up to 1.
     """
     young = min(SOON, new_prints) - 1
     old = new_prints - young
@@ -121,7 +121,7 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
         step: size of the rise, in units of the unknown spread of a print whose relative variance is 1.
         reference_variance: relative variances of the values of the reference prints, with shape (n,).
         new_variance: relative variances of the values of the new prints, with shape (m,).
-        rate: probability of a false alarm in all comparisons together.
+        rate: probability that any of the comparisons raises a false alarm.
     """
     limit, freedom, error = _comparison(reference_variance, new_variance, rate)
     return float(nct.sf(limit, freedom, step / error))
@@ -141,9 +141,8 @@ def noticeable_step(reference_variance: Array, new_variance: Array, rate: float,
 
 
 def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
-    """Consider the comparison of the last ``SOON`` prints with all prints before them. Return the value of t
-    above which this comparison raises an alarm, the degrees of freedom of t, and the standard error of the
-    step.
+    """For the comparison of the last ``SOON`` prints with all prints before them, return the value of t above
+    which an alarm is raised, the degrees of freedom of t, and the standard error of the step.
     """
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)

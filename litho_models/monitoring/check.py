@@ -60,8 +60,8 @@ def check(
         say(f"checking {len(dataset)} scans of {dataset.name}")
         found = gather(frozen, dataset, reference, new)
         parameters = frozen.card["parameters"]
-        # The error of the model on its training prints may be smaller than on unseen prints. In this case the
-        # two errors cannot be compared, so the error is not monitored.
+        # The error of the model on its training prints may be smaller than on unseen prints. In this case,
+        # the errors on training prints and on new prints cannot be compared, so the error is not monitored.
         optimistic = wording.too_optimistic(found.reference, parameters)
         judged = judge(
             found.reference,

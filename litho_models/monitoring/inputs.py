@@ -41,7 +41,7 @@ def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
     """Compute the monitored values of the scans of the new prints and of the reference prints. Only scans
-    that have the dose of most reference scans, or that state no dose, are kept.
+    that have the most frequent dose of the reference scans, or that state no dose, are kept.
 
     Raises:
         InputError: there is no reference, or more than one; a print is unknown; a store has another pitch or
@@ -127,8 +127,9 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """Keep only the scans whose dose is that of most reference scans. Scans with another dose are excluded,
-    because their gain was changed on purpose. Scans that state no dose are kept.
+    """Keep only the scans that have the most frequent dose of the reference scans. Scans with another dose
+    are excluded, because their dose was changed on purpose and the gain depends on the dose. Scans that state
+    no dose are kept.
     """
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:

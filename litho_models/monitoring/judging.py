@@ -31,7 +31,7 @@ class Trend(NamedTuple):
     Attributes:
         per_print: slope of the line, which is the change from print to print.
         ci95: 95 % confidence interval of ``per_print``.
-        p: two-sided p value of the hypothesis that the slope is zero.
+        p: two-sided p value for the hypothesis that the slope is zero.
         prints_left: number of further prints until the 95 % bound on the drift reaches the tolerance.
     """
 
@@ -45,9 +45,9 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     """Fit a straight trend to the values of all prints, and estimate the number of prints until the drift may
     reach the tolerance.
 
-    The drift is the change since the model was made. It is the slope of the trend times the number of prints
-    since then. The model is taken to have been made at the middle of the reference prints. The 95 % bound on
-    the drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift.
+    The drift is the change since the model was made, i.e. the slope of the trend times the number of prints
+    since then. The model is assumed to have been made at the middle of the reference prints. The 95 % bound
+    on the drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift.
     Sudden steps are not forecast; they raise an alarm.
 
     Args:

@@ -1,5 +1,5 @@
-"""The record ``check.json`` and the monitored quantities. A quantity has one value per print; the spread of
-these values between prints is computed here.
+"""The record ``check.json`` and the monitored quantities. A quantity has one value per print. This module
+also computes the spread of these values between prints.
 """
 
 from collections.abc import Callable, Sequence
@@ -56,7 +56,7 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """The names, the values and the numbers of scans of prints, in printing order. The value of a print is
+    """The name, the value and the number of scans of each print, in printing order. The value of a print is
     the mean over its scans.
     """
 
@@ -93,8 +93,8 @@ class Spread(NamedTuple):
 
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
-    """Return the names of the prints in printing order. The position of a print in this order is that of its
-    first scan.
+    """Return the names of the prints in printing order. Prints are sorted by the position of their first scan
+    in this order.
     """
     return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
@@ -103,7 +103,7 @@ def printing_order(
     reference: Sequence[ScanFigures], new: Sequence[ScanFigures], *, between: bool
 ) -> np.ndarray:
     """Return the printing order of all prints, as indices into the list of the reference prints followed by
-    the new prints. ``between`` is that of ``judge``.
+    the new prints. The argument ``between`` has the meaning that it has in ``judge``.
     """
     names = [*in_order(reference), *in_order(new)]
     if not between:
@@ -154,8 +154,8 @@ class CheckedModel(Record):
 class Alarm(Record):
     """A relative step in the mean of a monitored quantity. ``since`` is the name of the first changed print.
 
-    ``step`` is the mean from ``since`` on minus the mean before, relative to the mean before. Its confidence
-    interval does not account for the choice of ``since``.
+    ``step`` is the mean from ``since`` on, minus the mean of the earlier prints, relative to the mean of the
+    earlier prints. Its confidence interval does not account for the choice of ``since``.
     """
 
     since: str
@@ -195,7 +195,7 @@ class FigureCheck(Record):
 
 class Check(Result):
     """The record ``check.json``. ``verdict`` states the result in sentences for people, and ``alarm`` states
-    it for programs.
+    the result for programs.
 
     ``false_alarm_rate`` is the probability that a dataset of this size from an unchanged printer raises an
     alarm.

@@ -11,11 +11,13 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# The new layouts are taken to be of another kind if the relief (or the steepness) of all new prints is
-# greater, or of all new prints is smaller, than that of every reference print by more than this factor.
+# The new layouts are taken to be of another kind if all new scans have a greater relief than every reference
+# scan by more than this factor, or all have a smaller relief by more than this factor. The same holds for the
+# steepness.
 _OTHER_KIND = 1.1
-# The error on training scans is smaller than on unseen scans. If this difference is at most the value below,
-# in units of the spread, it does not raise the rate of false alarms noticeably.
+# The error on training scans is smaller than on unseen scans. The value below is the largest difference that
+# does not raise the rate of false alarms noticeably, in units of the spread of the error between reference
+# scans.
 _BEARABLE_OPTIMISM = 0.25
 
 
