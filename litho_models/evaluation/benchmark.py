@@ -74,7 +74,8 @@ def benchmark(
         background: ``training``, ``shared`` or ``none``; by default ``training``, or ``none`` for films. With
             ``training``, the smooth background that each fit learns from its training scans is added to its
             predictions. With ``shared``, each fit also learns a measurement model, which is applied to its
-            predictions. It levels whole scans, so it is refused for the quadrants of ``paper``.
+            predictions. A measurement model levels whole scans, so ``shared`` cannot be combined with the
+            quadrants of ``paper``.
         noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
             states is shown beside the errors. By default, the noise floor is estimated from the held-out
             residuals of the best model.
@@ -190,8 +191,8 @@ def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
     """
     fits: _Fits = {}
     done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
-    # The models take too different times to train for one common estimate of the remaining time. It is
-    # therefore estimated for each model separately, unless the fits run in other processes.
+    # The training times of the models differ too much for one common estimate of the remaining time. The
+    # remaining time is therefore estimated for each model separately, unless the fits run in other processes.
     of = len(jobs) if places.elsewhere else 0
     first, rest = jobs[0][1], len({job[1].number for job in jobs}) - 1
     started = time.monotonic()

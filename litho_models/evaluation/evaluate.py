@@ -41,8 +41,9 @@ def evaluate(
 
     A scan counts as locked if this store locks it, or if it was locked when the model was trained. A model
     counts as trained on these prints if it was trained on this store or on another store made from the same
-    raw files. Locked scans are then scored only if ``open_lock_box`` is set. A model trained on other prints
-    is scored on all scans. The result states which scans are locked and whether any of them was scored.
+    raw files. For such a model, locked scans are scored only if ``open_lock_box`` is set. A model trained on
+    other prints is scored on all scans. The result states which scans are locked and whether any of them was
+    scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -52,7 +53,8 @@ def evaluate(
             computed; by default ``offset``, or ``none`` for films.
         background: ``training`` (the default) adds the background stored in the model's card to the
             predictions; with ``none`` (the default for films), no background is added. If the card has no
-            background for fields of this size, none is added either, and the result says so.
+            background for scans of the size of those in the store, none is added either, and the result says
+            so.
         noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
             states is shown beside the errors.
         extrapolate: accept layouts with heights outside the calibrated range that the model's card states.

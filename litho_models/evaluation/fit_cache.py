@@ -73,9 +73,10 @@ def fit_or_load(
     fit and the heights, µm, that it predicts for the held-out scans, as one array of shape (ny, nx) per scan.
 
     Args:
-        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. It
-            is learned from the residuals of a first fit, and what it predicts is removed from the training
-            scans. Then the fit is repeated, and the measurement model is learned again.
+        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. The
+            measurement model is learned from the residuals of a first fit, and the contribution that it
+            predicts is removed from the training scans. Then the fit is repeated, and the measurement model
+            is learned again.
 
     Raises:
         InputError: the cached fit cannot be read.
@@ -105,8 +106,8 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the predicted scan. It is the predicted print combined with the background or with the
-    measurement model, which the fit learned from its training scans.
+    """Return the predicted scan. Depending on ``background``, the predicted print is combined with the
+    background or the measurement model that the fit learned from its training scans, or is returned alone.
     """
     found = record.diagnostics
     if background == "none":

@@ -102,8 +102,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Read a result. Return the facts that must agree before two results can be compared, and the scores of
-    this result, keyed by model name.
+    """Read a result. Return the facts that must be the same in two results that are compared, and the scores
+    of this result, keyed by model name.
     """
     file = Path(path)
     if file.is_dir():

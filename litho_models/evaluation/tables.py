@@ -27,8 +27,8 @@ def headline_table(
     intervals, the excess over the noise floor, the RMS error and the bias.
 
     The last row is the noise floor. In each column, the floor is computed with the same per-scan terms as the
-    errors above it. For films, the table lists the errors of edges and features instead of height errors, and
-    it has no noise floor.
+    errors of the models. For films, the table lists the errors of edges and features instead of height
+    errors, and it has no noise floor.
     """
     import pandas as pd
 
@@ -76,9 +76,9 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
-    """Return a table of mean absolute errors. It has one row for each model with and without its background,
-    and one column for each policy, i.e. set of per-scan terms. For the policy with line offsets
-    (``full+rows``), a second column states the effective number of terms per scan.
+    """Return a table of mean absolute errors. Each model has one row with its background and one without, and
+    each policy, i.e. set of per-scan terms, has one column. For the policy with line offsets (``full+rows``),
+    a second column states the effective number of terms per scan.
 
     The last row is the noise floor for each policy.
     """
