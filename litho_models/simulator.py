@@ -27,8 +27,8 @@ def spot_um(pitch_um: float) -> float:
     """Return the spot size (standard deviation, µm) from which a model derives its default lengths, given the
     pixel pitch of the layouts.
 
-    The result is ``FIRST_SPOT_UM`` if this length is between half a pixel and ten pixels. Otherwise the
-    layouts are taken to belong to another printer, whose spot is assumed to be two pixels wide.
+    The result is ``FIRST_SPOT_UM`` if this length is between half a pixel and ten pixels. If it is not, the
+    layouts are assumed to belong to another printer with a spot of two pixels.
     """
     low, high = _RESOLVED_PX
     return FIRST_SPOT_UM if low <= FIRST_SPOT_UM / pitch_um <= high else _SPOT_PX * pitch_um
@@ -36,8 +36,8 @@ def spot_um(pitch_um: float) -> float:
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
     """Return the values of a model's length settings (such as blur widths), scaled to the spot size for the
-    given pitch. If ``set_`` contains a length, this value is scaled; otherwise the default value is scaled.
-    If the scale is 1, the returned dict is empty.
+    given pitch. A length that ``set_`` contains is scaled from its value there, and any other length from its
+    default value. If the scale is 1, the returned dict is empty.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:

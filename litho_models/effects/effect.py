@@ -25,8 +25,8 @@ Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
 
-# Tolerance for values that lie on a bound, as a fraction of the range. It is needed because a value is
-# rounded when it is stored in float32.
+# Tolerance for values that lie on a bound, as a fraction of the range. The tolerance is needed because a
+# value is rounded when it is stored in float32.
 _ROUNDING = 1e-6
 
 
@@ -85,7 +85,7 @@ class FieldContext:
         new_tip: whether the scan was made with a new, sharp tip instead of the usual one.
         pixel_size: pixel size relative to that of the other scans. The time per pixel is the same in all
             scans, so the length over which the probe lags is proportional to the pixel size.
-        dose: dose relative to the recipe. It is already contained in ``layout_um``.
+        dose: dose relative to the recipe. This dose is already contained in ``layout_um``.
     """
 
     layout_um: Tensor
@@ -194,10 +194,11 @@ class Effect:
             of the base model. Both are in µm.
         parameters: the parameters, keyed by name. At least one of them must be an amplitude.
         apply: the formula, a pure function ``apply(field, values, context)`` that returns the changed field.
-            Both fields have shape (b, 1, ny, nx) and are in µm. For per-scan effects, it is
-            ``of_single_scans``.
+            The field given and the field returned have shape (b, 1, ny, nx) and are in µm. For per-scan
+            effects, ``apply`` is ``of_single_scans``.
         trials: parameter sets that screening tries. By default, one amplitude is switched on at a time. Each
-            of its ``tried`` values is combined with every combination of the ``tried`` values of the shapes.
+            ``tried`` value of this amplitude is combined with every combination of the ``tried`` values of
+            the shapes.
         source: where the formula comes from, such as a publication.
         separating: experiment that distinguishes this effect from similar effects.
         needs: what a test of the effect requires: ``order`` if the writing order of the scans must be known,
@@ -290,8 +291,8 @@ class Effect:
         is off.
 
         Args:
-            scanned: whether to treat the effect as caused by the microscope. If so, it depends on the
-                orientation, the direction and the tip of the scan.
+            scanned: whether to treat the effect as caused by the microscope. An effect of the microscope
+                depends on the orientation, the direction and the tip of the scan.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)

@@ -133,8 +133,8 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shorten every written line by δ at both ends (δ < 0 lengthens it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    The formula gives the correct area that is lost at an edge, but not the correct shape of the edge. This
-    does not matter, because the spot is wider than δ and determines the shape.
+    The formula gives the correct area that is lost at an edge, but not the correct shape of the edge. The
+    wrong shape does not matter, because the spot is wider than δ and determines the shape of the edge.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -185,7 +185,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach_um = _TAIL_LENGTHS * float(length.detach())
     starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
-    # Where another effect has already made the dose negative, this effect does not reduce it further.
+    # Where another effect has already made the dose negative, the dose is not reduced further.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
 

@@ -2,9 +2,9 @@
 function of the height, the slopes, the surroundings, the position in the scan or the writing order.
 
 A law is an effect with one strength (a wave has two) and fitted shapes, such as a power, a length, a
-direction or a position. It names no cause of the departure. Laws are screened, fitted, judged and applied by
-the same code as other effects. A table is an effect with many strengths. It can describe any dependence on
-one covariate, such as the level or the position, but it does not explain this dependence.
+direction or a position. A law names no cause of the departure. Laws are screened, fitted, judged and applied
+by the same code as other effects. A table is an effect with many strengths. A table can describe any
+dependence on one covariate, such as the level or the position, but does not explain this dependence.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from torch.nn import functional
 from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-# Frequencies of waves that screening tries. They are so close that a wave of any frequency between two of
-# them stays nearly in phase with one of the two over a height of one micrometre.
+# Frequencies of waves that screening tries. These frequencies are so close together that a wave of any
+# frequency between two neighbours stays nearly in phase with one of the two over a height of one micrometre.
 _WAVES_PER_UM = tuple(0.5 * half for half in range(2, 21))
 _FIELD: dict[ActsOn, str] = {"height": "height", "layout": "dose"}
 _WORDS = ("x", "y", "r²")
@@ -44,8 +44,8 @@ class Surface:
     """Compute the quantities that occur in the formula of a law, such as slopes and local means, from a
     field, its context and the parameters of the law.
 
-    ``h`` is the height, µm, of shape (b, 1, ny, nx). For a law of the exposure, it is the dose, expressed as
-    a nominal height.
+    ``h`` is the height, µm, of shape (b, 1, ny, nx). For a law of the exposure, ``h`` is the dose, expressed
+    as a nominal height.
     """
 
     h: Tensor
@@ -84,8 +84,8 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """Return a step function along an axis of the scan. It is 0 before the position that is a parameter
-        of the law and 1 beyond this position, and it rises linearly over one pixel.
+        """Return a step function along an axis of the scan. The step lies at the parameter ``position`` of
+        the law. The function is 0 before the step and 1 beyond it, and rises linearly over one pixel.
         """
         number = "yx".index(axis)
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
@@ -180,8 +180,8 @@ _POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 
 _TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
 _REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
 _TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0)), **_TURN}
-# For laws that depend on the position in the scan, screening tries only one value of the length. It is close
-# enough to the best value to start a fit.
+# For laws that depend on the position in the scan, screening tries only one value of the length. This value
+# is close enough to the best one to start a fit.
 _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
 
 

@@ -38,9 +38,9 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     by z += (H - z) / (1 + l / dx). The mean delay is removed.
 
     The lag has length l on falling edges, and length ``rising`` × l on rising edges, where the surface pushes
-    the probe. If ``rising`` is 1, the probe acts as a linear filter. If it is below 1, the probe parachutes
-    off falling edges, i.e. it loses contact there. The time constant of the lag is fixed, so the length is
-    shorter if the pixels are smaller.
+    the probe. If ``rising`` is 1, the probe acts as a linear filter. If ``rising`` is below 1, the probe
+    parachutes off falling edges, i.e. it loses contact there. The time constant of the lag is fixed, so the
+    length is shorter if the pixels are smaller.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -110,15 +110,16 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
     needs=("probe",),
 )
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Dilate the surface by a paraboloid tip of radius R: max over u of H(x - u) - u² / 2R. To first order,
-    this is H + R |grad H|² / 2.
+    """Dilate the surface by a paraboloid tip of radius R: max over u of H(x - u) - u² / 2R. To first order in
+    R, the dilated surface is H + R |grad H|² / 2.
 
     A tip may be sharper along or across the scan lines. Its radii in these directions are ``along`` × R and
     ``across`` × R.
     """
     radius = values["radius_um"]
-    # The formula divides by the radius. For tips sharper than ``_SHARPEST_UM``, it is therefore evaluated at
-    # this radius, and the change of the height is scaled in proportion to the true radius.
+    # The formula divides by the radius. For tips sharper than ``_SHARPEST_UM``, the formula is therefore
+    # evaluated at the radius ``_SHARPEST_UM``, and the change of the height is scaled in proportion to the
+    # true radius.
     blunt = radius.clamp(min=_SHARPEST_UM)
     # A paraboloid is the sum of two parabolas, so the maximum is taken along one axis after the other.
     across, along = blunt * values["across"], blunt * values["along"]

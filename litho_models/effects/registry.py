@@ -130,7 +130,7 @@ _FORWARD_ORDER = (
 TIP = measurement.tip_dilation.name
 
 CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
-# Laws and tables. They are not in the catalogue, because their causes are not known.
+# Laws and tables. Laws and tables are not in the catalogue, because their causes are not known.
 _NAMELESS = {**LAWS, **films.FILM_LAWS, **TABLES}
 
 

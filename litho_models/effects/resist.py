@@ -43,8 +43,8 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Apply the normalised tanh projection with threshold η and steepness α. It changes nothing for α² -> 0
-    and becomes a step for α² -> inf.
+    """Apply the normalised tanh projection with threshold η and steepness α. The projection changes nothing
+    for α² -> 0 and becomes a step for α² -> inf.
 
     With x = H / full height, the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
     expression equals the usual quotient of sums of tanh, and it is even and analytic in α.
@@ -177,7 +177,7 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
 
 def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
     """Return the maximum over 2 half_px + 1 neighbours along an axis. Each step of the computation doubles
-    the width.
+    the number of neighbours that are included.
     """
     size, width = 2 * half_px + 1, 1
     while width < size:
