@@ -39,9 +39,9 @@ def analyse_noise(
             their use) and scans that state a dose are also analysed.
         out: result folder.
         residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
-            The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. It also
-            contains the noise budget if none of the scans was used to train the model, which is always the
-            case for a benchmark.
+            The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. If none of
+            the scans was used to train the model that predicts it (as in a benchmark), the analysis also
+            contains the noise budget.
         model: name of a model in the benchmark; by default the best model.
         seed: seed of the random choice of pixels.
 
@@ -61,8 +61,8 @@ def analyse_noise(
         spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # The dose matrix also uses locked scans. This is harmless, because the matrix does not judge any
-        # model, and it is necessary, because there is often only one print at a dose.
+        # The dose matrix also uses locked scans. Their use is harmless, because no model is scored with the
+        # matrix, and necessary, because there is often only one print at a dose.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [

@@ -1,8 +1,9 @@
 """Estimate the noise of ordinary prints from the residuals of a model on held-out scans.
 
 There are two estimates of an upper limit of the noise. The first compares residuals at pixels whose
-surroundings in the layout are similar (``estimated_floor``). The second is the roughness in areas where the
-layout is flat. In such areas the errors of a model are small, so nearly all of the residual is noise.
+surroundings in the layout are similar (``estimated_floor``). The second estimate is the roughness of the
+residual in areas where the layout is flat. In such areas the errors of a model are small, so nearly all of
+the residual is noise.
 """
 
 from collections.abc import Iterator, Sequence

@@ -115,8 +115,8 @@ class SpreadAnalysis(Record, extra="ignore"):
     to all scans.
 
     ``nuisance`` names the terms that were removed from the residuals. ``left_out`` says whether prints or
-    scans are left out of each fit of the spread. Each fit is judged on the prints or scans that were left out
-    of it.
+    scans are left out of each fit of the spread. Each fit is tested on the prints or scans that were left out
+    of this fit.
     """
 
     model: str
@@ -140,9 +140,8 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit two models of the spread of the residuals, and judge each: a constant spread, and a spread that
-    depends on covariates. For each print, both models are fitted to all other prints and judged on this
-    print.
+    """Fit and test two models of the spread of the residuals: a constant spread, and a spread that depends on
+    covariates. For each print, both models are fitted to all other prints and tested on this print.
 
     If there are fewer than three prints, groups of scans are left out of the fits instead of prints. The
     shape and the scale of the distribution of residuals are fitted together.

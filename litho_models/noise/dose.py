@@ -31,8 +31,8 @@ _REACHES_UM = (1.0, 2.0)
 
 
 class LevelHeight(Record):
-    """The printed height of one level, measured from the lowest printed level. It is computed from all scans
-    at one dose together.
+    """The printed height of one level, measured from the lowest printed level. The height is computed from
+    all scans at one dose together.
     """
 
     level: int
@@ -88,8 +88,8 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     evaluated, and why. If too few doses can be evaluated, None is returned instead of the matrix.
 
     A dose is evaluated only if three levels have areas that are wide enough to measure. A matrix needs at
-    least two such doses. The recommended dose is the one whose heights are nearest to the nominal heights,
-    among those doses at which the fewest steps are lost.
+    least two such doses. Among the doses at which the fewest steps are lost, the recommended dose is the one
+    whose printed heights are nearest to the nominal heights.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:

@@ -59,7 +59,7 @@ class ReferencePrints(Record):
 
 def store_references(store: Store) -> list[Reference]:
     """Return the levelled scans of substrates, flat prints and steps in a store. The heights of each scan are
-    on the grid of the scan itself, not on that of a layout.
+    on the grid of the scan itself, not on the grid of a layout.
     """
     return [
         Reference(
@@ -119,8 +119,8 @@ class RepeatedPrints(Record):
 
     A polynomial of second degree is removed from the difference between two prints, so datum, tilt and bow
     are not included. Errors that repeat from print to print are not included either. ``ci95_nm`` is the 95 %
-    confidence interval of ``sigma_nm``, from resampling whole prints. It is None for fewer than six prints,
-    and if every pair contains the same print.
+    confidence interval of ``sigma_nm``, from resampling whole prints. The interval is None for fewer than six
+    prints, and if every pair contains the same print.
     """
 
     sigma_nm: float
@@ -134,11 +134,11 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     variance of the noise is half the variance of the difference between two such prints. Return None if there
     are no repeated prints.
 
-    Scans that may show the same printed field count once, because their difference does not contain the
-    noise of the print. Only the first of them is used.
+    Of several scans that may show the same printed field, only the first is used, because their difference
+    would not contain the noise of the print.
 
-    The mean absolute value of the noise is the mean absolute difference divided by √2. This relation is exact
-    for Gaussian noise, and correct within a few percent for other distributions of the noise (see
+    The mean absolute value of the noise is the mean absolute difference divided by √2. Dividing by √2 is
+    exact for Gaussian noise, and correct within a few percent for other distributions of the noise (see
     ``estimated_floor``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}

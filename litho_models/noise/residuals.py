@@ -31,7 +31,7 @@ class Residuals(NamedTuple):
     Attributes:
         maps_um: height maps that the model predicts, µm, one of shape (ny, nx) for each scan.
         residuals_nm: residuals of each scan, nm, after the terms of ``protocol`` are removed, with shape (ny,
-            nx). They are NaN at pixels that are not scored.
+            nx). The residuals are NaN at pixels that are not scored.
         held_out: True if none of the scans was used to train the model that predicts it.
     """
 
@@ -69,12 +69,12 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
     """Return the residuals (measured minus predicted height) of each scan, after the per-scan terms are
     removed. The terms that are removed from a pixel were fitted to other pixels.
 
-    The scored pixels, the policy and the background are those of the benchmark or, for a frozen model, those
-    of ``evaluate``. The mean absolute value of the residuals is therefore the error that the benchmark or
+    The scored pixels, the policy and the background are the same as in the benchmark or, for a frozen model,
+    as in ``evaluate``. The mean absolute value of the residuals is therefore the error that the benchmark or
     ``evaluate`` reports.
 
     Args:
-        store: dataset store on which the benchmark was run, or to whose scans the frozen model is applied.
+        store: dataset store of the benchmark, or store with the scans to which the frozen model is applied.
         source: a frozen model (a folder or ``zoo:NAME``), or the result folder of ``litho-models benchmark``,
             whose cache contains predictions of held-out scans. Scans are left out if the store locks them or
             if they were locked when the frozen model was trained.

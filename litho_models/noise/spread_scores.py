@@ -44,7 +44,7 @@ class Tails:
 
     @property
     def sd(self) -> float:
-        """Return the ratio of the standard deviation to the scale. It is finite only for more than two
+        """Return the ratio of the standard deviation to the scale. The ratio is finite only for more than two
         degrees of freedom.
         """
         return float(student.std(self.freedom))
@@ -88,8 +88,8 @@ GAUSSIAN = Tails()
 
 
 def normalised_calibration_error(residual: Array, sigma: Array) -> float:
-    """Return the expected normalised calibration error (ENCE). It is the mean of ``|rms σ − rms r| / rms σ``
-    over bins of σ, where r is the residual.
+    """Return the expected normalised calibration error (ENCE). The ENCE is the mean of ``|rms σ − rms r| /
+    rms σ`` over bins of σ, where r is the residual.
 
     See Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. The bins contain equal numbers of pixels.
     Pixels with the same σ are in the same bin, so for a constant σ there is only one bin. If each bin

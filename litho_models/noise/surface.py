@@ -44,8 +44,8 @@ class SurfaceNoise(Record, extra="ignore"):
 
 
 class PrintNoise(Record, extra="ignore"):
-    """The roughness that a print adds to that of the substrate, nm. Its square is the squared roughness of
-    the flat print minus the squared roughness of the substrate: ``print² = flat² − substrate²``.
+    """The roughness that a print adds to the substrate, nm. Its square is the squared roughness of the flat
+    print minus the squared roughness of the substrate: ``print² = flat² − substrate²``.
 
     ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
@@ -95,9 +95,9 @@ def without_background(height_um: np.ndarray, background: Background) -> np.ndar
 
 
 def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:
-    """Compute the roughness that a print adds, by subtracting the squared roughness of the substrate from
-    that of the flat print. This assumes that the roughness of the substrate and the noise of the microscope
-    are independent of the roughness of the print.
+    """Compute the roughness that a print adds, by subtracting the squared roughness of the substrate from the
+    squared roughness of the flat print. The subtraction assumes that the roughness of the substrate and the
+    noise of the microscope are independent of the roughness of the print.
 
     Args:
         flat: roughness of the flat print.

@@ -37,8 +37,8 @@ _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
 # Standard deviation of the optical spot. The layout is blurred by it before its slope is computed.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
-# Largest change of ln s² in one step of the fit, which keeps exp() finite. It is twice the largest effect of
-# a covariate that was seen for noise of 1 to 100 nm.
+# Largest change of ln s² in one step of the fit, which keeps exp() finite. The limit is twice the largest
+# effect of a covariate that was seen for noise of 1 to 100 nm.
 _LARGEST_STEP = 2.0
 _STEPS = 60
 
