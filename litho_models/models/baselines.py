@@ -1,6 +1,5 @@
-"""Baselines: simple models with which every other model is compared, and which it should surpass. They range
-from the unchanged layout to models that are linear in features. In the formulas, M is the layout and H the
-printed height.
+"""Baselines: simple models that every other model should surpass. The baselines range from the unchanged
+layout to models that are linear in features. In the formulas, M is the layout and H the printed height.
 """
 
 import torch
@@ -76,7 +75,7 @@ class BlurTable(Simulator):
 
     @property
     def sigma_um(self) -> Tensor:
-        """Return the standard deviation of the blur, µm. It is between 0 and ``sigma_max_um``."""
+        """Return the standard deviation of the blur, µm, which is between 0 and ``sigma_max_um``."""
         return self.ranges["tau"].value(self.tau)
 
     @property

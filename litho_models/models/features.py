@@ -232,9 +232,9 @@ class RandomFeatures(Features):
     """The model ``Features`` with additional features tanh(V z + c), where z are the standardised simple
     features. V and c are random and not fitted.
 
-    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It can
-    represent more functions than products of two features can, and its weights are still found in closed
-    form.
+    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). This
+    model can represent more functions than the products of two features, and its weights are still found in
+    closed form.
     """
 
     name = "random-features"

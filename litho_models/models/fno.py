@@ -1,4 +1,4 @@
-"""FNO: the Fourier neural operator. In the paper, it is the learned simulator without any knowledge of
+"""FNO: the Fourier neural operator. In the paper, the FNO is the learned simulator without any knowledge of
 physics.
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
@@ -133,7 +133,7 @@ class Fno(Simulator):
         return layout_um + height if config.starts_as_layout else height
 
     def _project(self, features: Tensor) -> Tensor:
-        """Apply the last two layers. They map features of shape (n, width) to a height of shape (n,)."""
+        """Apply the last two layers. These layers map features of shape (n, width) to a height of shape (n,)."""
         hidden = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=features.device.type, enabled=False):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
@@ -192,8 +192,8 @@ class SpectralConvolution(nn.Module):
             along_x = torch.complex(*(parts_x @ field).chunk(2, dim=2))
             spectra = (waves_y.conj() @ along_x.flatten(2)).unflatten(2, (kept_x, -1))
             mixed = torch.einsum("byxi,ioyx->byxo", spectra, matrices)
-            # Each frequency along x also represents the negative frequency, unless both are the same (zero
-            # and the Nyquist frequency).
+            # Each frequency along x also represents its negative, except zero and the Nyquist frequency,
+            # which equal their negatives.
             shares = (1 + (2 * k_x % nx).sign()).to(field)[:, None] / (ny * nx)
             lines = (waves_y.T @ (shares * mixed).flatten(2)).unflatten(2, (kept_x, -1))
             return parts_x.T @ torch.cat([lines.real, lines.imag], dim=2)
@@ -203,8 +203,8 @@ def _waves(frequencies: Tensor, size: int, like: Tensor) -> Tensor:
     """Return the waves exp(2πi k n / N) for the given frequencies k and the pixels n = 0 … N - 1, where N is
     ``size``. The result has shape (frequencies, N) and the precision and device of ``like``.
     """
-    # The products k n are whole numbers. They are reduced modulo N first, so that the angles stay exact for
-    # fields of any size.
+    # The products k n are whole numbers. The products are first reduced modulo N, so that the angles stay
+    # exact for fields of any size.
     turns = torch.outer(frequencies, torch.arange(size)) % size
     angle = (2 * math.pi / size) * turns.double()
     return torch.complex(angle.cos().to(like), angle.sin().to(like))

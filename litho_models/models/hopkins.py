@@ -37,7 +37,7 @@ class Optics(NamedTuple):
         outer, inner: outer and inner radius of a round or ring-shaped source, relative to the radius of the
             pupil. If both are 0, the source is a point.
         defocus_um: distance of the resist from the focus, µm.
-        kernels: number of kernels that are used. They are the kernels with the largest singular values.
+        kernels: number of kernels that are used, i.e. those with the largest singular values.
     """
 
     wavelength_um: float
@@ -54,9 +54,9 @@ def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
 
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
-    """Return the intensity of the image of a mask, relative to that of an open mask. The mask has shape
-    (batch, 1, ny, nx). The result is smaller than the mask: a border as wide as the radius of the kernels is
-    cropped on each side.
+    """Return the intensity of the image of a mask, relative to the intensity of an open mask. The mask has
+    shape (batch, 1, ny, nx). The result is smaller than the mask: a border as wide as the radius of the
+    kernels is cropped on each side.
     """
     reach = kernel_reach_px(optics, pitch_um)
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])

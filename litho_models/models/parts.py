@@ -67,8 +67,7 @@ class Part:
     Attributes:
         numbers: parameters of the part by name; ``source``: reference for the formula.
         data_sha256: hash of the file from which the part was made; empty if there is no such file.
-        apply: function with the arguments (field, values of the parameters, pitch in µm). It returns the next
-            field.
+        apply: function of (field, values of the parameters, pitch in µm) that returns the next field.
     """
 
     name: str

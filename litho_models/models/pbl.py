@@ -1,5 +1,5 @@
-"""PBL: physics-based learning. This is the main simulator of the paper. It models the known steps of the
-process by formulas and the unknown steps by networks.
+"""PBL: physics-based learning, the main simulator of the paper. PBL models the known steps of the process by
+formulas and the unknown steps by networks.
 
 PBL is a chain of five steps:
 
@@ -126,8 +126,8 @@ class PblConfig(SimulatorConfig):
 
     @property
     def exposing(self) -> Part:
-        """Return the part that models the illumination. It is the Gaussian spot, or the part that the
-        configuration names instead.
+        """Return the part that models the illumination: the Gaussian spot, or the part that the configuration
+        names instead.
         """
         return part_of(self.illumination or "spot")
 
@@ -338,8 +338,8 @@ class AreawiseNet(nn.Module):
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
             features = functional.leaky_relu(features, self.leaky_slope, inplace=True)
-        # The sum over the channels is a height. It needs the precision of float32, even if the other layers
-        # run in bfloat16.
+        # The sum over the channels is a height, which needs the precision of float32, even if the other
+        # layers run in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
                 features.to(self.last.weight.dtype), self._kernel(self.last), self.last.bias, padding=padding

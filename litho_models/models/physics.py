@@ -1,7 +1,7 @@
-"""Physics: the parameterised simulator of the paper. It has few physical values: six by default, five in the
-variants ``paper`` and ``authors``, and more if the width of the spot is fitted.
+"""Physics: the parameterised simulator of the paper. The model has few physical values: six by default, five
+in the variants ``paper`` and ``authors``, and more if the width of the spot is fitted.
 
-It is a chain of an optical blur, a threshold with a normalised tanh (projection; Zhou et al. 2014), a
+The model is a chain of an optical blur, a threshold with a normalised tanh (projection; Zhou et al. 2014), a
 diffusion blur, a shrinkage that depends on the dose, and a height bias. See arXiv:2309.17343, appendix
 "Parameterized physics model".
 """
@@ -44,8 +44,8 @@ class PhysicsConfig(SimulatorConfig):
     sigma_diffusion_max_um: float = Field(
         2.5, gt=0, description="upper bound of the diffusion, standard deviation, µm"
     )
-    # The starting values influence the result. If a fit starts from a steep threshold in the middle of the
-    # range, it ends with a nearly linear projection.
+    # The starting values influence the result. A fit that starts from a steep threshold in the middle of the
+    # range ends with a nearly linear projection.
     sigma_diffusion_init_um: float = Field(
         1.5, gt=0, description="diffusion before fitting, standard deviation, µm"
     )
@@ -59,8 +59,8 @@ class PhysicsConfig(SimulatorConfig):
         None, gt=0, description="gain before fitting; None: the gain is fixed at 1"
     )
     bias_init_um: float = Field(0.0, description="height bias before fitting, µm")
-    # Reference height H₀. With the value 1, heights in the equations are in µm. With None, they are in units
-    # of the full height. The paper does not state its reference height.
+    # Reference height H₀. With the value 1, heights in the equations are in µm. With None, heights are in
+    # units of the full height. The paper does not state its reference height.
     reference_height_um: float | None = Field(
         None, gt=0, description="height, µm, that counts as 1; None: the height of the highest level"
     )
@@ -141,8 +141,8 @@ class Physics(Simulator):
         return keys[self.config.spot]
 
     def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[float | Tensor, float | Tensor]:
-        """Return the standard deviation of the spot along y and along x, µm. If one of the two values is not
-        fitted, it is a Python number instead of a tensor.
+        """Return the standard deviation of the spot along y and along x, µm. A value that is not fitted is a
+        Python number instead of a tensor.
         """
         keys = self._spot_keys or ("",)
         given = self.config.sigma_optical_um
@@ -192,7 +192,8 @@ class Physics(Simulator):
         return self._develop(initial, crop_border(dose, margin), values)
 
     # The methods below receive the physical values as an argument, so that the values are computed only once
-    # per pass. This saves time, because every operation is slow in forward-mode differentiation.
+    # per pass. Computing them only once saves time, because every operation is slow in forward-mode
+    # differentiation.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
