@@ -76,10 +76,10 @@ class TrainingConfig(Record):
         a policy.
 
         The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
-        of 72 quadrants. It uses the learning rates of the paper and fits no per-scan terms. The recipe
-        ``fast`` uses AdamW with a one-cycle schedule and random crops, and fits per-scan terms together with
-        the model. ``FAST_STEPS`` contains the number of steps of ``fast`` for some models, and ``FAST_CHAIN``
-        contains the settings of ``fast`` for the default PBL model.
+        of 72 quadrants. This recipe uses the learning rates of the paper and fits no per-scan terms. The
+        recipe ``fast`` uses AdamW with a one-cycle schedule and random crops, and fits per-scan terms
+        together with the model. ``FAST_STEPS`` contains the number of steps of ``fast`` for some models, and
+        ``FAST_CHAIN`` contains the settings of ``fast`` for the default PBL model.
 
         Raises:
             InputError: the recipe is unknown.

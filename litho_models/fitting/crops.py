@@ -82,8 +82,8 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
     """Divide the windows of a step into groups, which the network processes one after the other.
 
-    On a CPU, a group has at most ``_PASS_PX`` pixels, unless a single window is larger. This limits the
-    memory without taking more time. On other devices, all windows form one group.
+    On a CPU, a group has at most ``_PASS_PX`` pixels, unless a single window is larger. Groups of this size
+    limit the memory without taking more time. On other devices, all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":

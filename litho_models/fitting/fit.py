@@ -67,7 +67,7 @@ def fit(
         model_name: a name in ``litho_models.models.MODELS``.
         scans: training scans, all with the same pitch, level height and number of levels.
         config: settings of the training and of the model.
-        checkpoint: folder for checkpoints. If it holds the checkpoint of an interrupted run, this run
+        checkpoint: folder for checkpoints. If the folder holds the checkpoint of an interrupted run, this run
             continues.
 
     Raises:
@@ -118,8 +118,8 @@ def fit(
 def fit_in_cache(
     model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
 ) -> Fitted:
-    """Fit a model as ``fit`` does. Checkpoints are kept in a folder inside ``cache``, whose name contains the
-    key of the fit (see ``run_key``).
+    """Fit a model as ``fit`` does. Checkpoints are kept in a subfolder of ``cache``. The name of the
+    subfolder contains the key of the fit (see ``run_key``).
 
     A benchmark and a closed loop that train the same model on the same scans therefore train it only once.
     """

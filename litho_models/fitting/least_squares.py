@@ -3,8 +3,9 @@ parameters of the model.
 
 The loss is a sum of squared or of absolute residuals r. To minimise absolute residuals, squared residuals are
 minimised with the weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals of a model and their
-derivatives. It also provides the ``room``, i.e. the smallest and the largest allowed step of each parameter.
-The fitted model is a process model, or the base model of the closed loop together with its effects.
+derivatives. The ``Problem`` also provides the ``room``, i.e. the smallest and the largest allowed step of
+each parameter. The fitted model is a process model, or the base model of the closed loop together with its
+effects.
 """
 
 from __future__ import annotations
@@ -25,8 +26,7 @@ Room = tuple[Array, Array]
 # measured print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
-# If a combination of normalised columns has a squared norm below this value, it is regarded as rounding
-# error.
+# A combination of normalised columns whose squared norm is below this value is regarded as rounding error.
 _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
@@ -71,10 +71,10 @@ class Rules:
             squared residuals.
         term_weight: weight, with the loss ``squares``, of the part of a residual that the terms of the scan
             can explain. The weight is large enough to determine the part of these terms that is common to all
-            scans (the common datum). It is small enough that the terms of a single scan do not bias the
-            parameters.
+            scans (the common datum). The weight is small enough that the terms of a single scan do not bias
+            the parameters.
         pinned: number of scan terms, with the loss ``absolute``, whose mean over the scans is held at zero.
-            They are the first rows of ``Linearised.basis``.
+            The pinned terms are the first rows of ``Linearised.basis``.
         steps: largest number of steps.
         relative_gain: the fit ends after a step that reduces the loss by less than this fraction of the loss.
         tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
@@ -293,8 +293,8 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
         return step
     factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
     target = np.linalg.solve(factor, right / scale)
-    # ``lsq_linear`` requires that the two bounds of a parameter differ. If they coincide, they are moved
-    # apart by so little that the parameter hardly moves.
+    # ``lsq_linear`` requires that the two bounds of a parameter differ. Bounds that coincide are moved apart
+    # by so little that the parameter hardly moves.
     width = np.maximum(room[1] - room[0], 1e-12)
     box = (room[0] * scale, (room[0] + width) * scale)
     return lsq_linear(factor.T, target, box, method="bvls").x / scale

@@ -22,8 +22,8 @@ from litho_models.models.pbl import Pbl
 from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 
-# Number of fitted pixels in all scans together. In each scan, they lie on a square grid. Their features take
-# 100 MB.
+# Number of fitted pixels in all scans together. The fitted pixels of each scan lie on a square grid. The
+# features of all fitted pixels take 100 MB.
 FITTED_PX = 2**18
 EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
 # Number of passes over all fitted pixels between two estimates of the per-scan terms.
@@ -44,8 +44,8 @@ class _Pixels(NamedTuple):
 def fit_feature_networks(
     model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
 ) -> RoundRecord:
-    """Fit the feature networks of ``model`` in place. They learn the residual of its chain (blurs and small
-    networks) by minimising the mean absolute error.
+    """Fit the feature networks of ``model`` in place. The feature networks learn the residual of the model's
+    chain (blurs and small networks) by minimising the mean absolute error.
 
     Line offsets are not fitted as per-scan terms here, because they average out over a scan.
 

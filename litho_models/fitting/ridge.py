@@ -30,7 +30,7 @@ KEPT_BYTES = 2**31
 # The first pass minimises squared residuals. The second pass reweights the pixels so that absolute residuals
 # are minimised, which reduces the influence of dirt on a print.
 PASSES = 2
-# Weight of the part of a residual that the per-scan terms can explain. With this small weight, this part
+# Weight of the part of a residual that the per-scan terms can explain. Even with this small weight, the fit
 # still determines the datum that all scans have in common.
 _TERM_WEIGHT = 1e-3
 
@@ -90,8 +90,8 @@ def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, F
 
 
 def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
-    """Return the k features at the n pixels of a scan whose flat indices are in ``at``. They are computed
-    tile by tile. The result has shape (k, n).
+    """Return the k features of a scan at n pixels, whose flat indices are in ``at``. The features are
+    computed tile by tile. The result has shape (k, n).
     """
     reach = model.reach_px
     layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], reach, reach)

@@ -66,7 +66,7 @@ def train(
     Args:
         store: dataset store; ``model``: name of a model; ``out``: folder for the run.
         recipe, variant: recipe of ``TrainingConfig``, and variant of the model.
-        settings: values for fields of ``TrainingConfig`` or of the model's configuration. They replace the
+        settings: values for fields of ``TrainingConfig`` or of the model's configuration, which replace the
             values of the recipe and the variant.
 
     Raises:

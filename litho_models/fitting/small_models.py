@@ -34,7 +34,7 @@ def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Poli
     """Fit ``model`` in place by minimising the mean absolute error. The fitted pixels are those in every
     second row and column of one window per scan.
 
-    If the policy contains line offsets (``full+rows``), they are not fitted, because they average out over a
+    Line offsets, which the policy ``full+rows`` contains, are not fitted, because they average out over a
     scan and hardly affect a small model.
 
     Returns:
@@ -51,8 +51,7 @@ def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Poli
 
 
 class ModelProblem:
-    """The least-squares problem of fitting a model to one window of each scan. It works on a copy of the
-    model.
+    """The least-squares problem of fitting a model to one window of each scan. A copy of the model is used.
 
     Args:
         model: the model to fit; ``scans``: training scans; ``terms``: names of the terms that are fitted to

@@ -149,7 +149,7 @@ def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
     """Take one optimiser step. Return the weighted absolute error, µm, and the mean weight as one tensor of
-    shape (2,). If a GPU is used, it may still be computing this tensor when the function returns.
+    shape (2,). A GPU may still be computing this tensor when the function returns.
     """
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
@@ -217,9 +217,9 @@ def _precision(config: TrainingConfig) -> Precision:
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
-    """Return the number of pixels by which tiles may extend beyond a scan in training. It is at least the
-    overlap of the tiles, which is the value used in prediction, and it is large enough for one tile to fit
-    into the extended scan.
+    """Return the number of pixels by which tiles may extend beyond a scan in training. This number is at
+    least the overlap of the tiles, as in prediction, and large enough for one tile to fit into the extended
+    scan.
     """
     if model.tile is None or config.crops != "random":
         return 0
