@@ -53,15 +53,16 @@ class CardMetric(Record):
 
 
 class ModelCard(RunFacts, Result):
-    """The card of a frozen model. It contains everything that is needed to load, use and judge the model.
+    """The card of a frozen model. The card contains everything that is needed to load, use and assess the
+    model.
 
-    ``background`` is the mean contribution of the microscope to the training scans. It is used only for
-    comparisons with measured heights and is never part of the height that the model predicts. ``at_bounds``
-    maps the name of each fitted value that lies on a bound of its range to this bound. ``baseline`` contains
-    the gain and the error (``ScanFigures``) of each scan on which the model was trained; ``litho-models
-    check`` compares new prints with these values. For some effects, the measurements do not determine whether
-    they arise in the printer or in the microscope. ``attributed`` maps the name of each such effect to the
-    side (printer or microscope) to which it was attributed when the model was frozen.
+    ``background`` is the mean contribution of the microscope to the training scans. This background is used
+    only for comparisons with measured heights and is never part of the height that the model predicts.
+    ``at_bounds`` maps the name of each fitted value that lies on a bound of its range to this bound.
+    ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on which the model was
+    trained; ``litho-models check`` compares new prints with these values. For some effects, the measurements
+    do not determine whether they arise in the printer or in the microscope. ``attributed`` maps the name of
+    each such effect to the side (printer or microscope) to which it was attributed when the model was frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -139,7 +140,7 @@ class ModelCard(RunFacts, Result):
 
     @property
     def page(self) -> str:
-        """Return the content of the card as a Markdown page. It begins with the metadata block that the
+        """Return the content of the card as a Markdown page, which begins with the metadata block that the
         Hugging Face Hub reads.
         """
         page = Path(__file__).with_name("readme.md.jinja")

@@ -36,9 +36,9 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
     the heights that the program and the model predict for a random layout.
 
     The program receives a layout in µm, float32 of shape (1, 1, size_px, size_px), and returns the printed
-    height in µm with the same shape. It checks neither the pitch nor the range of the layout's heights. Both
-    are stated in its metadata, which is the extra file ``card.json`` in a ``.pt2`` file, or the
-    ``metadata_props`` of an ONNX file.
+    height in µm with the same shape. The program checks neither the pitch nor the range of the layout's
+    heights. Pitch and range are stated in the metadata of the program: the extra file ``card.json`` in a
+    ``.pt2`` file, or the ``metadata_props`` of an ONNX file.
 
     Args:
         out: output file. Its suffix is ``.pt2`` (read by ``torch.export.load``) or ``.onnx`` (needs the extra
@@ -79,8 +79,8 @@ class _Numbers(TorchDispatchMode):
     """A torch mode that records the Python numbers which a model reads from tensors with ``Tensor.item`` in
     one run, and returns the same numbers in a second run.
 
-    These numbers are the radii of blur kernels and the end points of tables. They depend only on the weights,
-    so the exported program may contain them as constants.
+    These numbers are the radii of blur kernels and the end points of tables. Radii and end points depend only
+    on the weights, so the exported program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):

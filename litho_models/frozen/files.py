@@ -124,8 +124,8 @@ def push(source: str | Path, repository: str, *, private: bool = False) -> str:
 
     Args:
         source: the model to share, as for ``load_frozen``.
-        repository: ``owner/name`` of the repository. If the repository does not exist, it is created. A new
-            repository is private if ``private`` is set.
+        repository: ``owner/name`` of the repository. A repository that does not exist is created, and is
+            private if ``private`` is set.
 
     Raises:
         InputError: ``load_frozen`` cannot load the model, the repository rejects the upload, or

@@ -11,7 +11,7 @@ from litho_models.frozen.files import load_simulator, save_frozen
 
 # Name of the folder that holds the model in the output folders of `train` and `close-loop`.
 MODEL_FOLDER = "model"
-# Name of the part of a model that `Simulator.printer` leaves out. It is listed among the effects of
+# Name of the part of a model that `Simulator.printer` leaves out. This part is listed among the effects of
 # undetermined role, i.e. effects that may arise in the printer or in the microscope.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
@@ -35,7 +35,8 @@ def freeze(
             all of these effects, or a mapping from the name of an effect to its side. Effects attributed to
             the printer become part of the frozen model; those attributed to the microscope do not. The card
             records the attribution. The name ``scan-axis`` stands for the part of a base model that acts
-            along the lines of the scan. Without this part, the card states no background and no baseline.
+            along the lines of the scan. If the frozen model does not contain this part, the card states no
+            background and no baseline.
 
     Raises:
         InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a side

@@ -16,8 +16,8 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """Return the folder of a model. If the cache of huggingface_hub does not contain the model, it is
-    downloaded first.
+    """Return the folder of a model. A model that the cache of huggingface_hub does not contain is downloaded
+    first.
 
     Args:
         address: ``hf://owner/name`` or, for a certain revision, ``hf://owner/name@revision``.

@@ -69,8 +69,9 @@ def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
 
 
 def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Return True if the model was trained on the prints in this store. This is the case if the model's card
-    names the same dataset, or if the store contains scans that were locked when the model was trained.
+    """Return True if the model was trained on the prints in this store. The prints are taken to be the same
+    if the model's card states the hash of this dataset, or if the store contains scans that were locked when
+    the model was trained.
     """
     same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
     return same_dataset or bool(locked_by_the_card(model, dataset))
@@ -89,8 +90,8 @@ def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
 
     Raw files are compared because they stay the same if the store is built anew. Heights and lock boxes may
     change: other settings for levelling or registration change every height in the store, and an added or
-    missing scan changes which scans the store locks. If the card lists no raw files, the ids of the locked
-    scans that it names are returned instead, but only if the dataset has the same name.
+    missing scan changes which scans the store locks. If the card lists no raw files, the function returns the
+    ids of locked scans that the card names, but only if the dataset has the same name.
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):

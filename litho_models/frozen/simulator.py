@@ -1,5 +1,5 @@
-"""The class of loaded frozen models. It predicts prints with fixed weights, and checks the geometry and the
-heights of every layout.
+"""The class of loaded frozen models. A loaded model predicts prints with fixed weights, and checks the
+geometry and the heights of every layout.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class FrozenSimulator(nn.Module):
 
         Args:
             layout_um: nominal height, µm, of any float type and of shape (..., ny, nx): a NumPy array, an
-                xarray array, or a tensor. If an xarray array has the coordinates y_um and x_um, they are
+                xarray array, or a tensor. The coordinates y_um and x_um of an xarray array, if present, are
                 checked against the pitch. If the layout is a tensor, gradients flow to it.
             pitch_um: sampling of the layout; it is checked if given.
 

@@ -1,5 +1,5 @@
-"""Names and folders of the frozen models that come with the package (the zoo). They are the models that the
-benchmark table of the documentation compares.
+"""Names and folders of the frozen models that come with the package (the zoo). The zoo contains the models
+that the benchmark table of the documentation compares.
 
 ``load_frozen("zoo:pbl")`` loads the model ``pbl``, and ``load_frozen("zoo:best")`` loads the model with the
 smallest error on held-out scans.
@@ -46,7 +46,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
     Args:
         source: path or name that the user typed.
-        other: further names that the caller accepts. They are only listed in the error message.
+        other: further names that the caller accepts, which are only listed in the error message.
 
     Raises:
         InputError: there is no such folder, the zoo has no such model, or the model cannot be downloaded.
@@ -74,6 +74,6 @@ def card(name: str) -> dict[str, Any]:
 
 
 def _held_out_nm(name: str) -> float:
-    """Return the error of a zoo model on held-out scans, nm. It is the first metric of the card."""
+    """Return the error of a zoo model on held-out scans, nm, which is the first metric of its card."""
     metrics = card(name)["metrics"]
     return metrics[0]["value"] if metrics else float("inf")
