@@ -133,7 +133,7 @@ class Fno(Simulator):
         return layout_um + height if config.starts_as_layout else height
 
     def _project(self, features: Tensor) -> Tensor:
-        """Apply the last two layers. These layers map features of shape (n, width) to a height of shape (n,)."""
+        """Apply the last two layers, which map features of shape (n, width) to a height of shape (n,)."""
         hidden = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=features.device.type, enabled=False):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
