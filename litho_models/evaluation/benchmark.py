@@ -65,7 +65,7 @@ def benchmark(
             split of the quadrants of all scans). With ``paper``, the training set and the test set contain
             parts of the same scans, so errors are underestimated. Use it only for comparison with the paper.
         models: names of the models to compare.
-        settings: values for fields of ``TrainingConfig``, which replace those of the recipe.
+        settings: values for fields of ``TrainingConfig``, which replace the values of the recipe.
         folds: number of folds of the split ``grouped``, at most the number of unlocked printed fields.
         first_folds: number of folds to fit and score, for a quick comparison of seeds or settings; None fits
             and scores all folds.

@@ -35,8 +35,8 @@ from litho_models.splits.folds import Fold
 class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training, validation and held-out scans.
 
-    Each error is the datum-free error with the policy ``offset``, averaged over scans and computed without a
-    background. The three errors are computed in the same way, so differences between them show over-fitting.
+    Each error is the datum-free error, with the policy ``offset`` and without a background, averaged over
+    scans. The three errors are computed in the same way, so differences between them show over-fitting.
     ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the model of the
     microscope that was learned together with the fit, if there is one.
     """

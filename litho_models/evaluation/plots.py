@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
-# A function that receives the scores of one model. It returns a list of x values, followed by one or two
+# A function that receives the scores of one model and returns a list of x values, followed by one or two
 # lists of y values.
 Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 

@@ -15,8 +15,8 @@ def benchmark_verdict(result: Benchmark) -> str:
     """Return sentences that state which model predicts best, by how much, whether the difference to the other
     models is more than chance, and how large the noise floor is.
 
-    If the scans come from several prints, the test of the difference counts prints instead of scans as
-    independent units.
+    If the scans come from several prints, the test of the difference treats prints instead of scans as
+    independent.
     """
     best, second = [*sorted(result.scores, key=lambda one: one.leading_nm), None][:2]
     assert best is not None

@@ -4,13 +4,13 @@ false alarms.
 The test makes one comparison for each new print. The comparison for a print assumes that the mean changes in
 a step at this print and stays changed until the last print. The values before the step, which include those
 of the reference prints, are compared with the values after it by a t test with a pooled spread. Student's t
-distribution holds for any number of reference prints, although their mean and spread are unknown. This is the
-likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
-Technology 35, 355). The rate of false alarms is divided among the comparisons (Bonferroni). It therefore
-holds for all comparisons together, even if they are correlated. A step should be noticed within ``SOON``
-prints. Comparisons with at least that many prints after the step therefore get most of the rate. With three
-new prints, the test is nearly the t test of their mean, which is the best possible test if the spread is
-unknown.
+distribution holds for any number of reference prints, although their mean and spread are unknown. The method
+is the likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J.
+Quality Technology 35, 355). The rate of false alarms is divided among the comparisons (Bonferroni). The rate
+therefore holds for all comparisons together, even if they are correlated. A step should be noticed within
+``SOON`` prints. Comparisons with at least ``SOON`` prints after the step therefore get most of the rate. With
+three new prints, the test is nearly the t test of their mean, which is the best possible test if the spread
+is unknown.
 """
 
 from typing import NamedTuple
@@ -113,9 +113,9 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
     """Return the probability that a rise of the mean raises an alarm within ``SOON`` prints, or within all
     new prints if there are fewer.
 
-    The result is a lower bound. It is computed from a single comparison, in which the assumed step is at the
-    first print after the rise. The statistic of this comparison has a noncentral t distribution. All values
-    are assumed to be Gaussian.
+    The result is a lower bound. This bound is computed from a single comparison, in which the assumed step is
+    at the first print after the rise. The statistic of this comparison has a noncentral t distribution. All
+    values are assumed to be Gaussian.
 
     Args:
         step: size of the rise, in units of the unknown spread of a print whose relative variance is 1.
@@ -130,7 +130,7 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
     """Return the size of a step that raises an alarm with probability ``power``, in units of the spread of a
     print whose relative variance is 1. The result is infinite if the step exceeds ten thousand standard
-    errors. The other arguments are those of ``chance_to_notice``.
+    errors. The other arguments have the same meaning as in ``chance_to_notice``.
     """
     error = _comparison(reference_variance, new_variance, rate)[2]
 

@@ -48,7 +48,7 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     The drift is the change since the model was made, i.e. the slope of the trend times the number of prints
     since then. The model is assumed to have been made at the middle of the reference prints. The 95 % bound
     on the drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift.
-    Sudden steps are not forecast; they raise an alarm.
+    Sudden steps are not part of the forecast, because they raise an alarm.
 
     Args:
         values: one value per print in printing order, with shape (n,); at least three.
@@ -88,8 +88,8 @@ def judge(
     Args:
         reference, new: values of the scans of these prints, in any order; there must be at least three
             reference prints.
-        rate: probability of a false alarm if nothing has changed. It is divided among the quantities in
-            proportion to their weights.
+        rate: probability of a false alarm if nothing has changed. This probability is divided among the
+            quantities in proportion to their weights.
         tolerance: largest allowed relative drift of a quantity; by default three times its spread between
             reference prints.
         between: True if new prints may have been made between reference prints. The trend is then fitted to

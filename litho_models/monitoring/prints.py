@@ -126,7 +126,7 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
 
     The division is needed because the value of a print with one scan varies more than the value of a print
     with four scans, which is a mean. Prints with several scans show how much of the variation comes from the
-    scans. If the estimate of the variance between prints is negative, it is set to 0.
+    scans. A negative estimate of the variance between prints is set to 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)

@@ -1,5 +1,5 @@
-"""Write the ``report.html`` of a check. It contains the verdict, a control chart for each monitored quantity,
-and a table of scans.
+"""Write the ``report.html`` of a check. The report contains the verdict, a control chart for each monitored
+quantity, and a table of scans.
 """
 
 from __future__ import annotations
