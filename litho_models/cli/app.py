@@ -335,8 +335,8 @@ def freeze(
 
 
 def _attribution(given: Sequence[str]) -> Any:
-    """Parse the values of the option ``--attribute``. They state one side (printer or microscope) for all
-    effects, or one side for each named effect.
+    """Parse the values of the option ``--attribute``. The values state one side (printer or microscope) for
+    all effects, or one side for each named effect.
     """
     if len(given) == 1 and "=" not in given[0]:
         return given[0]

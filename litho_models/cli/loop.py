@@ -108,7 +108,8 @@ def close_loop(
     typer.echo(f"report: {out / 'report.html'}")
 
 
-# This exit code differs from those for bad input (2) and for a defect of this package (1).
+# Exit code of an alarm. It differs from the exit codes for bad input (2) and for a defect of this package
+# (1).
 EXIT_ALARM = 3
 
 

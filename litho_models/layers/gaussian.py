@@ -2,7 +2,8 @@
 is differentiable in the width of the kernel.
 
 Along each axis, blocks of pixels are multiplied by a band matrix that contains the kernel. For fields up to a
-few thousand pixels wide, this is faster than a Fourier transform, and it needs no periodic padding.
+few thousand pixels wide, these products are faster than a Fourier transform, and they need no periodic
+padding.
 """
 
 import math
@@ -99,7 +100,7 @@ def gaussian_blur(
 
 def kernel_radius_px(sigma_px: float) -> int:
     """Return the radius of a kernel that extends to ``SUPPORT_SIGMAS`` standard deviations, rounded up to
-    whole pixels. It is at least 1.
+    whole pixels. The result is at least 1.
 
     Raises:
         InputError: the Gaussian is wider than any field, or its width is not a number.

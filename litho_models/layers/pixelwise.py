@@ -21,8 +21,8 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
     flow to the features.
 
     Args:
-        function: receives the features of m pixels, as tensors of shape (m, ...), and returns their values,
-            of shape (m,). It must accept any m.
+        function: receives the features of m pixels, as tensors of shape (m, ...), and returns one value per
+            pixel, of shape (m,). The function must accept any m.
         features: tensors of shape (n, ...), with one row for each pixel.
         parameters: parameters of the function. Gradients flow to those parameters that are trained.
     """
@@ -93,8 +93,8 @@ class PointwiseNet(nn.Module):
     """A network with one input and one output, which is applied to each pixel separately (1 x 1
     convolutions).
 
-    The network is a piecewise-linear function of one variable. It is therefore not evaluated at every pixel,
-    but only at ``knots`` points (about a thousand). Between these points, its values are interpolated.
+    The network is a piecewise-linear function of one variable, and is therefore evaluated only at ``knots``
+    points (about a thousand) instead of at every pixel. Between these points, its values are interpolated.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):

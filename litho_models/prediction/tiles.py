@@ -1,5 +1,5 @@
-"""Predict layouts of any size tile by tile. For a model with a receptive radius, the result is the same as if
-the whole layout were computed at once. For other models, the result is blended from overlapping tiles.
+"""Predict layouts of any size tile by tile. For a model with a receptive radius, the result does not depend
+on the division into tiles. For other models, the result is blended from overlapping tiles.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
     The height is differentiable in the layout.
 
     A layout larger than ``tile_px`` is computed in tiles, each with a margin as wide as the receptive radius.
-    The heights equal those of the whole layout computed at once. A model without a receptive radius is called
-    with the whole layout.
+    The heights are the same as if the whole layout were computed at once. A model without a receptive radius
+    is called with the whole layout.
     """
     reach = model.reach_px
     ny, nx = layout_um.shape[-2:]
@@ -36,8 +36,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
     """Predict the height, µm, of the pixels that are at least the receptive radius r from the edge of the
     layout. For a layout of shape (batch, 1, ny, nx), the result has shape (batch, 1, ny - 2r, nx - 2r).
 
-    The height is differentiable in the layout. It is computed in tiles whose sides are at most ``tile_px``
-    pixels. The division into tiles does not change the result.
+    The height is differentiable in the layout. The layout is divided into tiles whose sides are at most
+    ``tile_px`` pixels. The division into tiles does not change the result.
 
     Raises:
         InputError: the model has no receptive radius, or the layout has no interior.
@@ -65,9 +65,9 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     """Predict the height, µm, of the pixels that are at least ``border_px`` pixels from the edge of the
     layout. The height is differentiable in the layout.
 
-    The border must be less than half as wide as the layout. The result is the same as that of
-    ``predict_field`` after the border is cropped. If the model allows it, only the pixels of the result are
-    computed (see ``FrozenSimulator.inside``).
+    The border must be less than half as wide as the layout. The result equals the result of ``predict_field``
+    after the border is cropped. If the model allows it, only the pixels of the result are computed (see
+    ``FrozenSimulator.inside``).
     """
     reach = model.reach_px
     if reach is None:
@@ -87,11 +87,12 @@ def blend_tiles(
     are repeated. The weights therefore also add up to one at the edge of the layout.
 
     Args:
-        function: receives tiles of shape (batch, 1, T, T) and returns their heights with the same shape.
+        function: receives tiles of shape (batch, 1, T, T) and returns heights of the same shape.
         layout_um: layout of any size, µm, with shape (batch, 1, ny, nx).
         tile: side T of the tiles and their overlap.
-        border_px: width, in pixels, of the border that is cropped from each side of the result. It must be
-            less than half the width of the layout. Tiles that lie entirely in the border are not computed.
+        border_px: width, in pixels, of the border that is cropped from each side of the result. This width
+            must be less than half the width of the layout. Tiles that lie entirely in the border are not
+            computed.
 
     Raises:
         InputError: an overlap of more than half a tile.
