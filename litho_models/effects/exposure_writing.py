@@ -48,8 +48,8 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Change the height of the print by the tilt and curvature of the focus surface over the write field: H +
-    1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
+    """Change the height of the print, because the focus surface is tilted and curved over the write field:
+    H + 1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
     field.
     """
     y, x = context.centred_um()
