@@ -35,8 +35,8 @@ def analyse_noise(
     """Analyse the noise of the prints in a store. Write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. Scans of a bare substrate, of a flat print or of steps (as the store states
-            their use) and scans that state a dose are also analysed.
+        store: dataset store. Scans that the store marks as bare substrate, flat print or steps, and scans
+            that state a dose, are also analysed.
         out: result folder.
         residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
             The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. If none of

@@ -88,8 +88,8 @@ class Calibration(Record, extra="ignore"):
 
 
 class SigmaBin(Record, extra="ignore"):
-    """The measured and the predicted spread of the residual, and the coverage of its intervals, for the
-    pixels within one range of one covariate.
+    """The measured and the predicted spread of the residual, and the coverage of the stated intervals, for
+    the pixels within one range of one covariate.
 
     The coverages are those of the 68 % and 95 % intervals. Each coverage has a 95 % confidence interval from
     resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.

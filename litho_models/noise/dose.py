@@ -202,8 +202,8 @@ def _level_parts(scan: PrintedScan) -> dict[int, Array]:
 
 
 def _linked_levels(scans: Sequence[Mapping[int, Array]]) -> set[int]:
-    """Return the levels whose heights can be compared: those of the scan with the most levels, those of the
-    scans that share a level with it, those of the scans that share a level with these, and so on.
+    """Return the levels whose heights can be compared. These are the levels of the scan with the most levels,
+    and of all scans that are linked to this scan by shared levels, directly or through other scans.
     """
     most = max(scans, key=len)
     linked = set(most)

@@ -46,8 +46,8 @@ class ReferencePrints(Record):
     """The results from the reference scans: the roughness of each substrate and flat print, the roughness
     that the print alone adds, and the evaluation of steps.
 
-    ``textures`` describes those substrates and flat prints whose scans have square pixels, after a quadratic
-    background is removed.
+    ``textures`` contains the textures of those substrates and flat prints whose scans have square pixels,
+    after a quadratic background is removed.
     """
 
     substrates: list[SurfaceNoise] = Field(default_factory=list)
@@ -134,8 +134,8 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     variance of the noise is half the variance of the difference between two such prints. Return None if there
     are no repeated prints.
 
-    Of several scans that may show the same printed field, only the first is used, because their difference
-    would not contain the noise of the print.
+    Of several scans that may show the same printed field, only the first is used, because the difference of
+    two scans of one field does not contain the noise of the print.
 
     The mean absolute value of the noise is the mean absolute difference divided by √2. Dividing by √2 is
     exact for Gaussian noise, and correct within a few percent for other distributions of the noise (see

@@ -1,7 +1,7 @@
 """Fit σ(x), the spread of a residual at each pixel. The logarithm of the spread is modelled as a linear
 function of covariates, which describe the layout at the pixel and the position of the pixel.
 
-The model of the height is fitted first and then kept fixed. Then the scale s of its residuals on held-out
+The model of the height is fitted first and then kept fixed. Then the scale s of the residuals on held-out
 scans is fitted as ln s² = X β by maximum likelihood, where the residuals follow Student's t distribution.
 Because the fit has these two stages, a wide spread cannot hide errors of the predicted height (compare
 Seitzer et al. 2022, arXiv:2203.09168). Only a few covariates are used, because some tens of scans do not
