@@ -122,8 +122,9 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
     geometry and its hyper-parameters.
 
     Raises:
-        InputError: the model, a field or a parameter to fix is unknown or belongs to a network inside the
-            model; a value is not allowed; or a registered model does not predict a map of finite heights.
+        InputError: the model or a field is unknown; a parameter to fix is unknown or belongs to a network
+            inside the model; a value is not allowed; or a registered model does not predict a map of finite
+            heights.
     """
     kind = model_class(name)
     for field in fields:

@@ -110,8 +110,8 @@ class FeatureNetwork(OfField):
         """
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
-        # Instead of standardising the inputs, the weights that multiply them are changed accordingly, which
-        # saves a pass over the pixels.
+        # The inputs are not standardised. Instead, the weights that multiply the inputs are changed
+        # accordingly, which saves a pass over the pixels.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre

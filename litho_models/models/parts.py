@@ -1,5 +1,6 @@
-"""Parts from which modular models of printers are assembled. A part contains a function that turns one field,
-such as a dose, into the next field, the parameters of this function, and a reference for its formula.
+"""Parts from which modular models of printers are assembled. A part contains three things: a function that
+turns one field, such as a dose, into the next field; the parameters of this function; and a reference for its
+formula.
 
 Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. The
 field that a part returns may be cropped by the receptive radius of the part.

@@ -67,7 +67,7 @@ class PblConfig(SimulatorConfig):
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
     # If True, the untrained model returns the optically blurred layout, and the networks learn the difference
-    # of the print from it. The networks in the paper start with random weights.
+    # between the print and this blurred layout. The networks in the paper start with random weights.
     starts_as_blur: bool = True
     kernel_support: Support = "four-sigma"
     kernel_cap_px: int | None = Field(
