@@ -313,8 +313,8 @@ def orthonormal(columns: Array) -> Array:
 
 
 def gram(columns: Array, basis: Array, weight_in_basis: float = 0.0) -> Array:
-    """Return the inner products of the columns. The contribution of the part of each column that lies in the
-    span of an orthonormal basis is multiplied by ``weight_in_basis``. ``columns`` has shape (n, m), ``basis``
+    """Return the inner products of the columns. The parts of the columns that lie in the span of an
+    orthonormal basis contribute with the weight ``weight_in_basis``. ``columns`` has shape (n, m), ``basis``
     has shape (n, k), and the result has shape (m, m).
     """
     return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)

@@ -50,8 +50,8 @@ def train_network(
 
     The best round is the one with the smallest error on the ``validation`` scans, or the last round if there
     are none. ``first_predictions_um`` returns the heights, µm, that a small model predicts for the training
-    scans; the per-scan terms of the first round are estimated from them. ``first_predictions_um`` is not
-    called if an interrupted run continues after its first round.
+    scans. From these heights, the per-scan terms of the first round are estimated. ``first_predictions_um``
+    is not called if an interrupted run continues after its first round.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
