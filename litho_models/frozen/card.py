@@ -31,8 +31,8 @@ _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported error or other value. ``split``, ``policy`` and ``background`` say on which scans it was
-    computed, with which nuisance terms fitted and with which background added.
+    """One reported error or other value. ``split``, ``policy`` and ``background`` say on which scans the
+    value was computed, which nuisance terms were fitted and which background was added.
 
     ``ci95`` is the 95 % confidence interval of the value, from resampling scans.
     """
