@@ -45,8 +45,8 @@ def gather(
 
     Raises:
         InputError: there is no reference, or more than one; a print is unknown; a store has another pitch or
-            level height than the model; the store of the new prints and that of the reference prints contain
-            the same scans; or there are too few prints.
+            level height than the model; the stores of the new prints and of the reference prints contain the
+            same scans; or there are too few prints.
     """
     if reference is not None and new:
         raise InputError("reference", got="both a store and --new", wanted="only one of these")

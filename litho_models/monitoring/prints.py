@@ -124,9 +124,9 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Compute the mean and the spread of a quantity over at least two prints. A one-way analysis of variance
     divides the spread into its variance between prints and within prints.
 
-    The division is needed because the value of a print with one scan varies more than the value of a print
-    with four scans, which is a mean. Prints with several scans show how much of the variation comes from the
-    scans. A negative estimate of the variance between prints is set to 0.
+    The division is needed because the mean over the four scans of one print varies less than the value of a
+    print with a single scan. Prints with several scans show how much of the variation comes from the scans. A
+    negative estimate of the variance between prints is set to 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
