@@ -76,7 +76,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
     Raises:
         InputError: a file cannot be read; the results differ in data, folds, scored scans or nuisance terms;
-            the model of one result was trained on the scored scans, but that of the other was not; or no
+            the model of one result was trained on the scored scans, but the model of the other was not; or no
             model is in both results.
     """
     import pandas as pd
