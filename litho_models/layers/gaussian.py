@@ -55,8 +55,8 @@ def gaussian_blur(
         pitch_um: pixel pitch of the field, µm.
         edge: how the field is padded beyond its edge: ``replicate`` repeats the outermost pixels, and
             ``zero`` adds zeros. In both cases, the result has the shape of the field. With None, the field is
-            not padded, and the result contains only the pixels that are at least the radius r from the edge,
-            and has shape (..., ny - 2r, nx - 2r).
+            not padded. The result then contains only the pixels that are at least the radius r from the edge,
+            with shape (..., ny - 2r, nx - 2r).
         radius_px: radius r of the kernel in pixels, or a pair of radii (along y, along x); by default four
             standard deviations, rounded up.
 
