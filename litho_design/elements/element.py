@@ -103,8 +103,8 @@ class Element(nn.Module):
     def forward(
         self, field: Tensor, wavelength_um: float, height_um: Tensor | np.ndarray | None = None
     ) -> Tensor:
-        """Return the wave behind the element when ``field`` illuminates it, a complex tensor of shape
-        (..., size, size).
+        """Return the wave behind the element when ``field`` illuminates it. The wave is a complex tensor of
+        shape (..., size, size).
 
         Args:
             field: the incident wave on the pixels of the layout, a complex tensor of shape (..., size, size).
@@ -113,8 +113,8 @@ class Element(nn.Module):
                 replace the heights that the model predicts for the levels.
 
         Raises:
-            InputError: field or heights do not have the shape of the element, a height is missing, or the
-                wavelength is not one that the element can have.
+            InputError: field or heights do not have the shape of the element, a height is missing, or
+                ``optics`` rejects the wavelength.
         """
         self._check_map("field", field)
         if self.kind == "thin":
@@ -191,7 +191,7 @@ class Element(nn.Module):
         if not ((pixels >= 0) & (pixels <= highest)).all():
             raise InputError(what, got=f"{pixels.min():g} to {pixels.max():g}", wanted=f"0 to {highest}")
         values = self.free.cells.average(pixels)
-        # Means of real levels are rounded to float32.
+        # Averages over a cell are rounded to float32, so equal levels may differ slightly from their average.
         if (self.free.cells(values) - pixels).abs().max() > 1e-3:
             cell = "ring" if self.free.cells.radial else "cell"
             raise InputError(

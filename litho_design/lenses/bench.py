@@ -74,7 +74,7 @@ class LensOptics(nn.Module):
         raise NotImplementedError
 
     def oblique_path_um(self) -> Tensor | float:
-        """Return the extra path of oblique light to each of these points, float64, µm."""
+        """Return the extra path of oblique light to each point that has a height, float64, µm."""
         return 0.0
 
     def thin(self) -> Self:
@@ -182,7 +182,8 @@ def centre_to_background(psf: Tensor, centre_px: float, element_px: int) -> Tens
     left = torch.arange(side, dtype=torch.float64, device=psf.device) - side / 2
     inside = ((left + 1).clamp(max=half_px) - left.clamp(min=-half_px)).clamp(min=0).to(psf)
     first, last = max(math.floor(side / 2 - half_px), 0), min(math.ceil(side / 2 + half_px), side)
-    # The cut comes after the product, so that a box of whole pixels is summed in the order of the PSF's rows.
+    # The box is cropped after the multiplication, so that a box of whole pixels is summed in the order of the
+    # PSF's rows.
     box = (psf * inside[:, None] * inside)[..., first:last, first:last].sum()
     rest = (1 - box) / (element_px**2 - centre_px**2)
     return box / centre_px**2 / rest

@@ -38,8 +38,9 @@ class ImagingScore(Record):
     the search never used.
 
     The name of each score states the image to which it belongs. ``design`` is the sensor image deconvolved
-    with the PSF that the design expected, and ``calibrated`` is the sensor image deconvolved with the PSF of
-    the print itself. ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
+    with the PSF that was predicted for the design, and ``calibrated`` is the sensor image deconvolved with
+    the PSF of the print itself. ``direct`` is the sensor image without deconvolution, scaled to minimise its
+    error.
     """
 
     mae_direct: float = Field(description="MAE of the sensor image of test objects, at the best scale")
@@ -128,13 +129,13 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
 def imaging_score(
     psf: Tensor, design_psf: Tensor, objects: Tensor, settings: ImagingSettings
 ) -> dict[str, float]:
-    """Form sensor images of objects through ``psf``, reconstruct the objects with each of the two PSFs, and
-    return the scores (see ``ImagingScore``). The objects have shape (n, size, size).
+    """Form sensor images of objects through ``psf``, reconstruct the objects once with ``psf`` and once with
+    ``design_psf``, and return the scores (see ``ImagingScore``). The objects have shape (n, size, size).
 
     Args:
-        psf: PSF of the print, which is the share of the incident power on each pixel of the window, shape
-            (window, window).
-        design_psf: PSF that the design expected, in the same form as ``psf``.
+        psf: PSF of the print: the share of the incident power on each pixel of the window, shape (window,
+            window).
+        design_psf: PSF that was predicted for the design, in the same form as ``psf``.
     """
     real, expected = (sensor_psf(one, settings.pixel_px).float() for one in (psf, design_psf))
     draws = []

@@ -33,9 +33,9 @@ class LensView(Record):
     """Aperture, PSF window and search path of a lens.
 
     The PSF window around the focus is ``window_px`` pixels wide; its pixels have the pitch of the layout.
-    With ``path="radial"``, the search prints only a strip along one radius and propagates light from rings,
-    instead of using the whole plane. This needs a circular aperture and a layout of rings. Scores are always
-    computed on the plane.
+    With ``path="radial"``, the search predicts the print of only a strip along one radius and propagates
+    light from rings, instead of using the whole plane. This path needs a circular aperture and a layout of
+    rings. Scores are always computed on the plane.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})

@@ -222,7 +222,8 @@ class ComputationalLensTask(LensTask):
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
         """Return the scores of the PSF and of the images of the held-out objects.
 
-        ``expected_um`` is the print that the design expected; by default, it is the scored print.
+        ``expected_um`` contains the heights of the expected print, which was predicted when the layout was
+        designed. If it is None, the scored print is used.
         """
         with torch.no_grad():
             psf, design_psf = (self.bench(height_um if one is None else one) for one in (None, expected_um))
@@ -267,8 +268,8 @@ def check_lens(settings: LensSettings, *, radial: bool) -> None:
     """Check that the settings describe a lens that can be designed, along a radius if ``radial`` is True.
 
     Raises:
-        InputError: the light along a radius is not that of the lens, the propagation is the far field, or the
-            outermost zone of a focusing lens is narrower than two cells.
+        InputError: a search along a radius cannot represent the layout, the aperture or the light; the
+            propagation is the far field; or the outermost zone of a focusing lens is narrower than two cells.
     """
     if radial and (settings.layout.symmetry != "radial" or settings.view.aperture != "circle"):
         raise InputError(
@@ -293,8 +294,8 @@ def check_lens(settings: LensSettings, *, radial: bool) -> None:
 
 def _check_outermost_zone(settings: LensSettings) -> None:
     """Check that the outermost zone of the lens is at least two cells wide. The width of this zone is the
-    wavelength divided by the sum of two sines: that of the ray from the farthest point of the rim to the
-    image, and that of oblique light, which a side of the rim adds to it.
+    wavelength divided by the sum of two sines: the sine of the ray from the farthest point of the rim to the
+    image, and the sine of the oblique light. On one side of the rim, the two add up.
     """
     layout, optics = settings.layout, settings.optics
     radius_um = layout.size_um / 2 * (math.sqrt(2) if settings.view.aperture == "square" else 1)

@@ -1,6 +1,4 @@
-"""Convolve by FFT. In the convolution and in its gradient, only those samples are computed that the result
-contains.
-"""
+"""Convolve by FFT. The convolution and its gradient compute only the samples that the result contains."""
 
 from __future__ import annotations
 
@@ -59,8 +57,8 @@ class KernelPropagator(nn.Module):
 
 
 def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int]:
-    """Return the shape of a finer grid that begins and ends at the same pixel centres. ``finer`` states how
-    many of its pixels fit into one pixel along y and x.
+    """Return the shape of a finer grid that begins and ends at the same pixel centres as a grid of shape
+    ``shape``. ``finer`` states how many fine pixels fit into one coarse pixel along y and x.
     """
     rows, columns = ((count - 1) * times + 1 for count, times in zip(shape, finer, strict=True))
     return rows, columns
@@ -94,8 +92,8 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 
 
 class _Convolution(torch.autograd.Function):
-    """A convolution with its gradient. The adjoint of the convolution is a convolution with the conjugate
-    transfer function, whose input and output shapes are exchanged.
+    """A convolution with its gradient. The adjoint is a convolution with the conjugate transfer function,
+    with the shapes of input and output exchanged.
 
     The gradient is implemented explicitly, because autograd would keep padded copies and transform rows that
     are cropped afterwards.

@@ -57,8 +57,8 @@ class RadialPropagator(nn.Module):
 
     @property
     def ring_area_um2(self) -> Tensor:
-        """Return the area of each ring, µm^2, float64 of shape (rings,). The sum of |u|^2 times this area is
-        a power.
+        """Return the area of each ring, µm^2, float64 of shape (rings,). The power of a field u is the sum of
+        |u|^2 times this area.
         """
         return math.pi * self.ring_width_um**2 * (2 * torch.arange(self.rings, dtype=torch.float64) + 1)
 

@@ -10,15 +10,15 @@ from dataclasses import replace
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 
-# Sampling creates a copy of the spectrum around the frequency 1/pitch. The evanescent wave at this frequency
-# must decay over this number of decay lengths, after which 4e-6 of it remains.
+# Sampling creates a copy of the spectrum around the frequency 1/pitch. The intensity of the evanescent wave
+# at this frequency must decay by the factor exp(-2 pi n), where n is this number; 4e-6 of it then remains.
 _DECAY_LENGTHS = 2.0
 
 
 def centred_grid(
     shape: tuple[int, int], pitch_um: float, centre_um: tuple[float, float] = (0.0, 0.0)
 ) -> PixelGrid:
-    """Make a grid of square pixels whose middle lies at the position ``centre_um`` (y, x). This holds for
+    """Make a grid of square pixels. The middle of the grid lies at the position ``centre_um`` (y, x), for
     even and odd numbers of pixels.
     """
     grid = PixelGrid.square(shape, pitch_um)

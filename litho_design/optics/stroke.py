@@ -31,8 +31,8 @@ class Stroke(Record):
 
 def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
     """Return the efficiency, according to scalar theory, of a blazed grating whose periods consist of
-    ``steps`` equal steps and whose stroke is ``gain`` waves. This counts the step that follows the highest
-    one, where the next period begins.
+    ``steps`` equal steps and whose stroke is ``gain`` waves. The heights of the steps are k ``gain`` /
+    ``steps`` waves, where k runs from 0 to ``steps`` - 1.
     """
     return staircase_efficiency([gain * step / steps for step in range(steps)], order)
 
@@ -62,7 +62,7 @@ def measure_stroke(
         level_height_um: nominal height of one level, µm.
 
     Returns:
-        The stroke, and the efficiency of this grating in the first and the zero order.
+        The stroke, and the efficiency of a blazed grating with these levels in the first and the zero order.
         The record also states two ways to make the stroke one wave: the number of levels if their height is
         kept, and the height of a level if the number of levels is kept.
     """

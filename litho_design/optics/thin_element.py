@@ -102,9 +102,9 @@ class Optics(Record):
         return self.incidence_x * x_um + self.incidence_y * y_um
 
     def edge_sine(self, radius_um: float) -> float:
-        """Return the sine of the angle, seen from the image, between the axis and a point of the element at
-        a distance ``radius_um`` from the axis. An ideal lens, which forms the far field, has radius / focal
-        length instead.
+        """Return the sine of the angle, seen from the image, between the axis and a point of the element at a
+        distance ``radius_um`` from the axis. For the far field, which an ideal lens forms, return radius /
+        focal length instead.
         """
         far_field = self.propagation == "far-field"
         return radius_um / (self.distance_um if far_field else math.hypot(radius_um, self.distance_um))
@@ -116,13 +116,14 @@ class Optics(Record):
 
 
 def check_incidence(grid: PixelGrid, optics: Optics) -> None:
-    """Check that the light of one wave reaches every pixel at a real angle, and that pixels sample its phase.
+    """Check that the incident light has a real angle at every pixel, and that the pixels sample its phase.
 
-    The sine of the angle at a pixel is that of the incidence plus that of the ray from a near point source.
+    The sine of the angle at a pixel is the sine of the oblique incidence plus, for a near point source, the
+    sine of the ray from this source.
 
     Raises:
-        InputError: along one axis, the sine reaches wavelength / (2 pitch), above which the sampled wave
-            goes in another direction; or the sine as a whole reaches 1.
+        InputError: along one axis, the sine reaches wavelength / (2 pitch), above which the sampled wave goes
+            in another direction; or the sine over both axes reaches 1.
     """
     farthest_um = [float(abs(axis).max()) for axis in (grid.y_um, grid.x_um)]
     distance_um = optics.source_distance_um
@@ -159,7 +160,7 @@ def known_height(height_um: Tensor | np.ndarray, like: Tensor) -> Tensor:
             height = torch.from_numpy(np.array(height_um, np.float64)).to(like)
         except (TypeError, ValueError) as error:
             raise InputError("heights of a print", got=error, wanted="an array of heights in µm") from None
-    # A transform of torch.func does not allow a program to read the values.
+    # Inside a transform of torch.func, values cannot be read, so they are not checked.
     if torch._C._functorch.is_functorch_wrapped_tensor(height):
         return height
     if missing := int((~height.isfinite()).sum()):
