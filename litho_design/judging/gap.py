@@ -1,5 +1,5 @@
-"""Records of the design-to-manufacturing gap: the designs of every arm (model to design with) and seed, with
-their prints as predicted by every judge (model that predicts the prints of finished designs).
+"""Records of the design-to-manufacturing gap. Each arm (a model used for design) makes one design per seed,
+and each judge (another or the same model) predicts the prints of all designs, which are then scored.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from litho_design.tasks.design import DESIGNS
 
 
 class GapEntry(Record):
-    """The design of one arm and seed, printed by one judge. ``designed`` contains the scores that the arm's
-    own model predicts.
+    """One design (of one arm and one seed), with the scores of the print that one judge predicts.
+    ``designed`` contains the scores of the print that the arm's own model predicts.
     """
 
     arm: str
@@ -37,8 +37,8 @@ class GapEntry(Record):
 
 
 class GapSummary(Record):
-    """One score of the designs of one arm, as one judge predicts their prints: its mean over seeds with a 95
-    % confidence interval.
+    """The mean of one score over the designs of one arm (one design per seed), with a 95 % confidence
+    interval. One judge predicts the prints.
     """
 
     arm: str
@@ -52,8 +52,8 @@ class GapSummary(Record):
 
 
 class PairedDifference(Record):
-    """The difference of one score between the designs of two arms, printed by the same judge and paired by
-    seed.
+    """The difference in one score between designs of two arms with the same seed, averaged over the seeds.
+    One judge predicts the prints.
     """
 
     judge: str
@@ -71,8 +71,8 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # The types are ordered by their number of fields, because the settings of a user-defined task have only
-    # the fields common to all designs.
+    # The type with the fewest fields comes first, because the settings of a user-defined task have only the
+    # fields common to all designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]

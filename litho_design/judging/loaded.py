@@ -1,4 +1,4 @@
-"""Read a finished design back from its folder, so that any judge can print and score it."""
+"""Read a finished design from its folder, so that any model can predict its print, which is then scored."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ class LoadedDesign:
         folder: folder of the design.
         record: the contents of ``design.json``.
         level: levels of the layout, shape (size, size).
-        expected_um: height, µm, of the print that the design expects, shape (size, size).
+        expected_um: height, µm, of the expected print, which was predicted when the layout was designed,
+            shape (size, size).
         task: the task that the layout was designed for.
         target: target image of a hologram, shape (size, size), or None for other tasks.
         bench: the optics, which turn a height map into an image or a PSF.
@@ -51,7 +52,8 @@ class LoadedDesign:
         device: where prints and waves are computed.
         element: ``thin`` or ``thick``, to override the kind of element that the design states (see
             ``Optics``).
-        band_px: if given, a large hologram is printed and scored in bands of at most this many rows.
+        band_px: if given, the print of a large hologram is predicted and scored in bands of at most this many
+            rows.
 
     Raises:
         InputError: the folder is incomplete or was altered, the task is not registered here, this machine
@@ -113,7 +115,7 @@ class LoadedDesign:
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:
-        """Return the height, µm, of the layout as ``judge`` predicts its print, shape (size, size)."""
+        """Return the printed height, µm, that ``judge`` predicts for the layout, shape (size, size)."""
         self.task.check_printer(judge)
         return self.task.printed_um(self.level, judge)
 
@@ -150,7 +152,7 @@ class LoadedDesign:
 
 
 def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> LoadedDesign:
-    """Return the finished design in ``folder``, ready to be printed and scored on ``device``.
+    """Return the finished design in ``folder``. Its prints are predicted and scored on ``device``.
 
     Raises:
         InputError: ``LoadedDesign`` rejects the folder or the device.

@@ -31,19 +31,19 @@ _SMALLEST_FOR_TIP = 64
 # Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
 # step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# A deviation counts as dust if less than the first number, a share, of the other places with the same
-# expected height deviate. Heights count as the same if they differ by less than the second number.
+# A deviation counts as dust if fewer than this share of the other pixels with the same expected height
+# deviate as well. Heights that differ by less than ``_LIKE_HEIGHT_UM`` count as the same.
 _LARGEST_DUSTY_SHARE, _LIKE_HEIGHT_UM = 0.3, 0.005
-# Standard deviation of the change of the heights that the AFM tip causes, as a share of this change.
+# Standard deviation of the height correction for the AFM tip, as a share of this correction.
 _TIP_SD = 0.3
 # Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
-# The deviations of a print from the expected print are larger in tilt and bow than in these orders, by this
-# factor. In addition, all tilt and bow of a print may be wrong by one common factor; the second number is its
-# standard deviation. Both numbers were found with ``benchmarks.coverage``.
+# In tilt and bow, a print deviates from the expected print more than in the orders above, by the factor
+# ``_LARGER``. In addition, all tilt and bow of a print may be wrong by one common relative error, whose
+# standard deviation is ``_COMMON_SD``. Both numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
-# Number of groups of pixels with nearly the same expected height.
+# Number of groups into which the pixels are divided by their expected height.
 _HEIGHTS = 32
 
 
@@ -53,10 +53,10 @@ class MeasuredRecord(Record):
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
     ``tilt_um_per_um`` (x, y) is the tilt that was removed, and ``bow_um`` is the range, over the element, of
     the bow that was removed. ``noise_um`` is the residual at spatial frequencies at which prints have no
-    structure. Tilt and bow of the print itself are removed as well; ``removed_sd_um`` is the standard
-    deviation of each of their terms. ``position_sd_um`` is the standard deviation of a corner's position
-    along one axis, and ``scale_sd`` is the relative standard deviation of the height scale. ``defect_share``
-    is the share of the element that shows dust or scars instead of the print.
+    structure. Levelling also removes the tilt and bow of the print itself; ``removed_sd_um`` is the standard
+    deviation of each term of this tilt and bow. ``position_sd_um`` is the standard deviation of a corner's
+    position along one axis, and ``scale_sd`` is the relative standard deviation of the height scale.
+    ``defect_share`` is the share of the element that shows dust or scars instead of the print.
     """
 
     name: str
@@ -110,9 +110,10 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     """Resample the measured heights of a printed design onto the pixels of its layout.
 
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
-    set so that the medians of the measured and the designed print agree. Tilt and bow of the scanner are
-    fitted together with the designed print, so that no part of the shape of the design is removed. Unmeasured
-    pixels are filled with the heights of the designed print.
+    set so that the median difference between the measured and the expected print is 0. The expected print is
+    the one that was predicted when the layout was designed. Tilt and bow of the scanner are fitted together
+    with the gain of the expected print, so that no part of the shape of the design is removed. Unmeasured
+    pixels are filled with the heights of the expected print.
 
     Args:
         loaded: the design.
@@ -122,8 +123,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         The height of the print, µm, shape (size, size), and the record of the measurement.
 
     Raises:
-        InputError: the scan cannot be registered, covers too little of the element, or does not
-            resemble the print that the design expects.
+        InputError: the scan cannot be registered, covers too little of the element, or does not resemble the
+            expected print.
     """
     from litho_data.readers import read_scan
 
@@ -279,7 +280,7 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
     height, valid = resample_to_layout(
         scan.height_um, found.scan_to_layout, level.shape, **pitches, bend_um=found.bend_um
     )
-    # The uncertainty of a corner is that along both axes together.
+    # ``corner_sd_nm`` combines both axes, so it is divided by sqrt(2) for one axis.
     position_sd_um = quality.corner_sd_nm / 1000 / math.sqrt(2)
     return _Placed(height, valid, quality.dihedral, quality.warning, position_sd_um)
 
@@ -321,7 +322,7 @@ def fitted_background(
 
 def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tensor]:
     """Yield pairs of prints of shape (ny, nx), in µm, to which random noise as strong as that of the scan is
-    added. The noise in the second print of a pair is that in the first with the opposite sign.
+    added. The two prints of a pair have the same noise with opposite signs.
     """
     generator = np.random.default_rng(0)
     for _ in range(DRAWS):
@@ -368,8 +369,8 @@ def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
     """Displace a print of shape (ny, nx) by an affine map. If the numbers in ``corner_px``, shape (2, 3), are
     random with the standard deviation s, the corners move by s px (rms) along each axis.
 
-    An affine map that is fitted to points spread evenly over a square has this uncertainty: the variances of
-    its shift and of the displacements of an edge by its two linear terms are in the ratio 1 : 3 : 3.
+    For an affine map fitted to points spread evenly over a square, the variance of the shift and the
+    variances of the displacements of an edge by the two linear terms are in the ratio 1 : 3 : 3.
     """
     from scipy.ndimage import affine_transform
 
@@ -393,11 +394,12 @@ def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
 
 
 def _removed_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:
-    """Return the standard deviation, in µm, of the tilt and bow that the print itself may have, for each
-    polynomial term of order 1 or 2.
+    """Return the standard deviation, µm, that each polynomial term of order 1 or 2 (tilt and bow) may have in
+    the print itself.
 
-    The value is ``_LARGER`` times the rms of the terms of orders 3 to 6 in ``off_um``, the deviation from the
-    expected print, after its mean at every expected height is subtracted. Both maps have shape (ny, nx).
+    First, the mean deviation at every expected height is subtracted from ``off_um``, the deviation from the
+    expected print. The value is ``_LARGER`` times the rms of the terms of orders 3 to 6 in the rest. Both
+    maps have shape (ny, nx).
     """
     foreign = off_um.ravel().copy()
     for places in np.array_split(np.argsort(expected_um, axis=None), _HEIGHTS):
@@ -407,6 +409,6 @@ def _removed_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:
 
 
 def _amounts(height_um: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Return how much of each of the orthogonal ``shapes``, shape (ny, nx, n), a map contains."""
+    """Return the coefficients of a map in the orthogonal ``shapes``, shape (ny, nx, n)."""
     found: np.ndarray = np.tensordot(height_um, shapes, 2) / height_um.size
     return found

@@ -28,7 +28,7 @@ from litho_design.optics.imaging import Blur, richardson_lucy
 # Largest accepted standard deviation of the SI-PSNR, in dB. A score that is less certain cannot decide
 # between designs.
 _LARGEST_SD_DB = 0.5
-# Standard deviation of the change of a score that a blur of the camera causes, as a share of this change.
+# Standard deviation of the effect that a blur of the camera has on a score, as a share of this effect.
 _BLUR_SD = 0.3
 
 
@@ -49,8 +49,8 @@ class PhotoScore(Record):
 class LensPhotoScore(Record):
     """Error, PSNR and SSIM of one photographed object; each image is scaled to minimise its error.
 
-    ``direct`` is the photograph itself. ``design`` is the photograph deconvolved with the PSF that the design
-    expected. ``calibrated`` is the photograph deconvolved with the PSF of the measured print, or None if the
+    ``direct`` is the photograph itself. ``design`` is the photograph deconvolved with the PSF of the expected
+    print. ``calibrated`` is the photograph deconvolved with the PSF of the measured print, or None if the
     print was not measured.
     """
 
@@ -155,10 +155,10 @@ def score_lens_photo(
 ) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
-    ``photographed_image`` cleans the photograph and registers it to the image that the design expects of this
-    object, on sensor pixels. Then the photograph is deconvolved by the Richardson-Lucy algorithm with the
-    number of iterations of the design. The image of the object must be as large as in the design; otherwise,
-    the PSFs do not apply.
+    ``photographed_image`` cleans the photograph and registers it to the image of this object that the
+    expected print would form, on sensor pixels. Then the photograph is deconvolved by the Richardson-Lucy
+    algorithm with the number of iterations of the design. The image of the object must be as large as in the
+    design; otherwise, the PSFs do not apply.
 
     Args:
         loaded: the design of a lens.
@@ -168,7 +168,7 @@ def score_lens_photo(
             computed.
 
     Raises:
-        InputError: there is no object, the object is unknown, two objects share its name, or
+        InputError: ``source`` names no object, an unknown object or a name that two objects share, or
             ``photographed_image`` rejects the photograph.
     """
     assert isinstance(loaded.task, LensTask)

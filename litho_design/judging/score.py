@@ -108,10 +108,10 @@ class Judgement:
         scores: one per judge.
         pictures: mapping from titles to the images that reports show, shape (m, m): the target image, and the
             image or PSF behind each print.
-        side_um: width of these images, µm.
+        side_um: width of the images in ``pictures``, µm.
         photos: for a photographed lens, mapping from titles to images of shape (n, n): the object, the
             photograph and the reconstructions.
-        frame_um: width of these images, µm.
+        frame_um: width of the images in ``photos``, µm.
     """
 
     scores: list[JudgedScore]
