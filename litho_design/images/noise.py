@@ -15,7 +15,7 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of random draws of the noise. The rms change of a score over this number of draws is known to 25 %.
+# Number of random draws of the noise. From this many draws, the rms change of a score is known to 25 %.
 DRAWS = 8
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
@@ -32,8 +32,8 @@ def white_noise(values: np.ndarray) -> float:
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
     """Return the standard deviations of two kinds of noise in a photograph of shape (ny, nx). The first value
-    is that of the noise in the dark, in counts. The second is that of the noise proportional to the light, as
-    a share of the light.
+    is the standard deviation of the noise in the dark, in counts. The second is the standard deviation of the
+    noise that is proportional to the light, as a share of the light.
 
     The second kind includes speckle.
 
@@ -73,8 +73,9 @@ def estimated(
     change that undoing the fit causes is therefore added.
 
     Variants come in pairs, with an error and the same error of opposite sign. In ``left`` and ``hidden``,
-    each pair changes one independent parameter by its standard deviation. Mean and variance are then those of
-    a score that is a sum of quadratic functions of normally distributed parameters (JCGM 100:2008, 5.1.2).
+    each pair changes one independent parameter by its standard deviation. Mean and variance are then exact
+    for a score that is a sum of quadratic functions of normally distributed parameters (JCGM 100:2008,
+    5.1.2).
 
     Args:
         score: function that scores a variant.

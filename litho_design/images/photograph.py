@@ -1,4 +1,4 @@
-"""Clean a photograph and register it to the image that a design expects."""
+"""Clean a photograph and register it to the expected image, which was predicted for the design."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ _NEEDED = 0.93
 # A fitted tilt counts as real if its chi squared exceeds this limit. Random errors exceed 13.8 with a
 # probability of 0.1 % (two degrees of freedom).
 _TILT_SURE = 13.8
-# The images of the prints that different models of the same printer predict differ in size by this standard
-# deviation (rms over three holograms and five models), so the scale of a photograph cannot be determined more
-# accurately from its image.
+# Different models of the same printer predict prints whose images differ in size by this relative standard
+# deviation (rms over three holograms and five models). A photograph cannot determine its scale more
+# accurately than this.
 _PRINT_SCALE_SD = 0.015
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
@@ -64,12 +64,12 @@ class CameraRecord(Record):
     ``orientation`` is the operation that brings the photograph into the orientation of the image;
     ``ambiguous`` lists other operations that fit equally well. ``photo_to_window`` is a 3 x 3 matrix that
     acts on ``(x, y, 1)`` and maps pixels of the file to pixels of the expected image. ``noise_counts`` is the
-    standard deviation of the noise in the dark, and ``noise_share`` is that of the additional noise, relative
-    to the light. ``position_sd_um`` is the standard deviation of the fitted position along one axis, and
-    ``scale_sd`` is the relative standard deviation of the fitted scale. ``vignetting_sd`` is the standard
-    deviation of the possible loss of light in the camera's corners. ``blur_um`` is the standard deviation
-    (radius) of the fitted blur that is added to the expected image. The counts are proportional to a power of
-    the light, and ``gamma`` is the fitted exponent.
+    standard deviation of the noise in the dark, and ``noise_share`` is the standard deviation of the
+    additional noise, as a share of the light. ``position_sd_um`` is the standard deviation of the fitted
+    position along one axis, and ``scale_sd`` is the relative standard deviation of the fitted scale.
+    ``vignetting_sd`` is the standard deviation of the possible loss of light in the corners of the
+    photograph. ``blur_um`` is the standard deviation (radius) of the fitted blur that is added to the
+    expected image. The counts are proportional to a power of the light, and ``gamma`` is the fitted exponent.
     """
 
     name: str
@@ -135,14 +135,15 @@ class Photograph:
         side_px: side of the window, in window pixels.
         pitch_um: side length of a window pixel.
         finest_per_um: the highest spatial frequency that the image can have, in cycles/µm.
-        averaged_um: side of the pixels over which the image stays averaged, µm (see ``photographed_image``).
+        averaged_um: side, µm, of the pixels over which ``image`` averages the light (see
+            ``photographed_image``).
         record: source and processing of the photograph.
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
         other_warps: for each independent fitted movement of the camera, the two maps after a movement by plus
             and minus its standard deviation.
-        other_tilts: the same pairs of maps for two independent tilts that were too small to be fitted; empty
-            if a tilt was fitted. Such a tilt may be the camera's or the print's, so each pair has half of its
-            variance.
+        other_tilts: such pairs of maps for two independent tilts that were too small to be fitted; empty if a
+            tilt was fitted. A small tilt may come from the camera or from the print, so half of its variance
+            is counted in ``with_other_faults`` and half in ``with_other_fits``.
     """
 
     counts: np.ndarray
@@ -169,8 +170,8 @@ class Photograph:
         return image * self._camera_pixels(self.window_to_photo) / power_counts
 
     def with_more_noise(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images to which random noise as strong as that of the photograph is added. The noise
-        in the second image of a pair is that in the first with the opposite sign.
+        """Yield pairs of images to which random noise as strong as that of the photograph is added. The two
+        images of a pair have the same noise with opposite signs.
         """
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
@@ -212,11 +213,12 @@ class Photograph:
         flat = counts / (1 - vignetting * _radius_squared(counts.shape))
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
-        # The light is spread over as many camera pixels as this map assigns to a window pixel.
+        # With this map, a window pixel collects the light of more or fewer camera pixels than with the fitted
+        # map.
         found = found * (self._camera_pixels(warp) / self._camera_pixels(self.window_to_photo))
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
-        # Detail finer than the light from the element can form is noise. The remaining detail is corrected
-        # for the difference between the averaging over a camera pixel and that in the expected image.
+        # Detail finer than the light from the element can form is noise. The remaining detail is corrected,
+        # because a camera pixel averages over another area than a pixel of the expected image.
         frequency = np.arange(side) / (2 * side * self.pitch_um)
         camera = np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
         sharp = (frequency <= self.finest_per_um) * np.sinc(frequency * self.averaged_um) / camera
@@ -231,7 +233,7 @@ def photographed_image(
     finest_per_um: float,
     averaged_um: float = 0.0,
 ) -> Photograph:
-    """Register a photograph to the image that the design expects.
+    """Register a photograph to the expected image, which was predicted for the design.
 
     The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
     neighbours. Then a model of the camera is fitted to the expected image by least squares. The position,
@@ -242,12 +244,12 @@ def photographed_image(
 
     Args:
         wanted: expected image in any unit, shape (m, m).
-        wanted_pitch_um: side of its pixels, µm.
+        wanted_pitch_um: side of the pixels of ``wanted``, µm.
         source: greyscale image of any bit depth whose counts are proportional to the light. If the dark level
             is unknown, it is chosen so that the darkest pixels have the expected brightness.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
-        averaged_um: side of the pixels over which the expected image is averaged, µm, so that the photograph
-            is averaged as much; 0 if the image contains values at points.
+        averaged_um: side, µm, of the pixels over which the expected image is averaged; the photograph is
+            averaged over the same area. Give 0 if the expected image contains values at points.
 
     Raises:
         InputError: the file is not an image, the pitch is not positive or too coarse for the light, or the
@@ -430,7 +432,7 @@ def _unlike(photo_file: str | Path, correlation: float) -> InputError:
 def _replace_outliers(photo: np.ndarray, finest_per_px: float) -> tuple[np.ndarray, int]:
     """Replace outliers by the median of their 3 x 3 neighbourhood. Outliers deviate from this median by much
     more than most pixels. If the light has detail that is not much wider than a pixel (``finest_per_px``,
-    cycles/px), outliers also lie as far beyond all of their neighbours.
+    cycles/px), outliers must also exceed all of their neighbours, or lie below all of them, by as much.
     """
     import cv2
 
@@ -488,12 +490,13 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
     pose[:2] = _shift_px(fixed, seen(smooth, pose))
     free = [0, 1, 2] + ([3] if pitch_sd else [])
-    # A unit of angle (sine), log scale or tilt moves the edge as much as a shift of half a window.
+    # A change of 1 in the angle (sine), the log scale or a tilt moves the edge by half a window.
     unit = np.array([1, 1, *[2 / side] * 4])
     # Residuals of neighbouring pixels are not independent, so this number of pixels counts as one independent
     # pixel.
     alike = 4 * math.pi * blur_px**2
-    # The correlation alone is as accurate if the last step changes the sum of squares by less than this part.
+    # The fit ends when a step changes the sum of squares by less than this part. For the correlation alone,
+    # 1e-4 is accurate enough.
     close = 1e-8 if further else 1e-4
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
@@ -550,7 +553,9 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     light = _light(seen(photo, pose), wanted, alike)
 
     def around(columns: list[int], covariance: np.ndarray) -> list[list[np.ndarray]]:
-        """Return the two maps after each independent change of these columns of the pose."""
+        """For each independent change of the pose in these columns, return the map after this change and the
+        map after the opposite change.
+        """
         variance, ways = np.linalg.eigh(covariance)
         steps = np.zeros((len(columns), len(pose)))
         steps[:, columns] = (ways * np.sqrt(variance.clip(0))).T * unit[columns]
