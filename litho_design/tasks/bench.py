@@ -41,8 +41,8 @@ class ElementBench(nn.Module):
         return self.carried[_key(self.optics.wavelength_um)]
 
     def illumination(self) -> Tensor:
-        """Return the wave behind a flat element, for the middle wave of the source, as complex128 of shape
-        (size, size).
+        """Return the wave behind a flat element, for the middle wavelength and direction of the source, as
+        complex128 of shape (size, size).
         """
         return flat_field(self.grid, self.optics)
 

@@ -60,7 +60,7 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """The findings that a task reports about the levels that it found and their predicted print.
+    """What a task reports about the levels of the finished design and about their predicted print.
 
     ``thick`` contains the scores of the print when it is computed as a thick element.
     """

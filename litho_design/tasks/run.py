@@ -232,7 +232,7 @@ def _seconds_after(task: Task, level: Tensor) -> float:
     """Estimate the time, in seconds, that the run takes after the search. In this time, the layout is chosen,
     and the scores and the yield are computed.
 
-    The estimate is based on one print by each model and one draw of the process window, which are timed.
+    For this estimate, one print prediction by each model and one draw of the process window are timed.
     """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()

@@ -166,7 +166,8 @@ class Task:
     def untouched(self) -> dict[str, Tensor]:
         """Return a dict from names to uncorrected layouts of shape (size, size).
 
-        By default, this is only the start of the search for a printer that prints nominal heights.
+        By default, the only such layout is the one from which the search would start for a printer that
+        prints nominal heights.
         """
         if set(self.starts) == {"random"}:
             return {}
@@ -176,7 +177,7 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses according to several models into one loss. ``losses`` has shape (models,). By
+        """Combine the losses that several models predict into one loss. ``losses`` has shape (models,). By
         default, return the maximum.
         """
         return losses.max()
@@ -211,7 +212,8 @@ class Task:
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
         """Score a print, given as heights in µm of shape (size, size).
 
-        ``expected_um`` is the print that the design expected; by default, it is the scored print.
+        ``expected_um`` contains the heights of the expected print, which was predicted when the layout was
+        designed. If it is None, the scored print is used.
         """
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
@@ -237,8 +239,8 @@ class Task:
         return write_arrays(folder, self.arrays(level, height_um))
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Return the findings about the levels and their print that the record contains. The arrays are
-        already in ``folder``.
+        """Return what the record states about the levels and their print. The arrays are already in
+        ``folder``.
         """
         layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
@@ -379,7 +381,7 @@ class Task:
         """Return the loss of ``seen``, which is the light behind the print that ``printer`` predicts, and a
         dict of the named parts of this loss.
 
-        By default, the result is that of ``loss`` and does not depend on ``printer``.
+        By default, the result of ``loss`` is returned and does not depend on ``printer``.
         """
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})

@@ -1,5 +1,5 @@
-"""The width of a design, i.e. the difference between the predictions of all models for its layout and for
-uncorrected layouts.
+"""The width of a design, i.e. how far the scores that different models predict for its layout lie apart.
+Uncorrected layouts are scored for comparison.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Width(Record):
             candidates are the layout found by the search and the uncorrected layouts.
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
         figure: name of the main score, which is the first headline score of the task.
-        less: True if this score is better when lower.
+        less: True if the main score is better when lower.
         loss_unit: factor that converts the loss to the unit of the main score. It is given only if the loss
             is an error that includes the expected error of the model's prediction; otherwise, it is None.
         level_heights_um: for each model, the printed height of a wide uniform field of each level.
@@ -38,17 +38,17 @@ class Width(Record):
     level_heights_um: dict[str, list[float]]
 
     def values(self, candidate: str | None = None) -> np.ndarray:
-        """Return the main score of a candidate according to every model, by default that of the returned
-        candidate.
+        """Return the main score of a candidate according to every model. If no candidate is named,
+        ``returned`` is used.
         """
         by_model = self.figures[candidate or self.returned].values()
         return np.array([figures[self.figure] for figures in by_model])
 
     @property
     def between(self) -> tuple[float, float]:
-        """Return the range in which the main score of a real print is expected. It is the range of the values
-        according to all models. If the expected errors of the models' predictions are known, each value is
-        first extended on both sides by twice the error of its model, in quadrature.
+        """Return the range in which the main score of a real print is expected. This range covers the values
+        that all models predict. If the expected error e of each model is known, each value v is first
+        replaced by the interval from sqrt(v^2 - (2e)^2) to sqrt(v^2 + (2e)^2).
         """
         values = self.values()
         if self.loss_unit is None:
@@ -77,8 +77,8 @@ class Width(Record):
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """Return the level whose printed height the models disagree about most, and the lowest and the
-        highest height that they predict for it, µm.
+        """Return the level on whose printed height above level 0 the models disagree most, and the lowest and
+        the highest value that they predict for this height, µm.
         """
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]
