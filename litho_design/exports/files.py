@@ -87,7 +87,7 @@ def export(
         design: a design (its folder, or the result of ``load_design``), an ``Element``, an array of shape
             (ny, nx), or a file NAME.npy with such an array. Arrays of integers are levels. Arrays of floats
             are heights in µm, which are rounded to the nearest level. Floats that are all whole numbers are
-            refused, because they could be either.
+            refused, because they could be levels or heights.
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; it may already hold exports of the same layout in other formats.
         pitch_um, level_height_um: side of a pixel and height of a level, used only for arrays. Designs and

@@ -1,5 +1,5 @@
-"""Settings of a print job that the layout does not contain: those of the file format, of the base under the
-element, and of the slices and lines in which it is printed.
+"""Settings of a print job that the layout does not contain: the file format, the base under the element, and
+the slices and lines in which the element is printed.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Print two marks beside an element: an F that shows its orientation, and a flat witness area for its
-height.
+"""Add two marks beside an element: an F, which shows the orientation of the print, and a flat witness area,
+which shows its height.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Box = tuple[int, int, int, int]
 # An F looks different in all eight orientations.
 _LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 _STROKE_UM = 1.0
-# Width of the middle part of the witness area. Its distance from the edges exceeds the reach of the printer,
+# Width of the middle part of the witness area. It is at least the reach of the printer away from the edges,
 # so the edges do not affect its printed height.
 _FLAT_UM = 4.0
 

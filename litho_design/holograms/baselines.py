@@ -23,7 +23,7 @@ _PHASE_ITERATIONS = 100
 _PHASE_RATE = 0.3
 # Names of the scores that are defined for any image.
 _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
-# The baselines that were found. They need no printer, so all arms of a comparison share them.
+# Cache of the baselines. They do not depend on the printer, so all arms of a comparison share them.
 _KEPT: dict[tuple[object, ...], dict[str, dict[str, float]]] = {}
 
 
@@ -80,7 +80,7 @@ def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tens
     The signal is the set of pixels whose target exceeds 0.5. Each step is u <- exp(j arg P^H S P u), where u
     is the wave behind the element, P is the propagator and S is the mask of the signal; every pixel has its
     own phase. The operator P^H S P is positive semidefinite, so no step reduces the power, and the result is
-    never below that of the print.
+    never below the share that the print itself reaches.
     """
     signal = target > 0.5
     wave = element_field(height_um, bench.grid, bench.optics)

@@ -146,8 +146,8 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the SSIM between the image that a camera records of the waves and the target, which is sampled
-    on the pixels of the camera.
+    """Return the SSIM between the image that a camera records of the waves and the target, both sampled on
+    the pixels of the camera.
     """
     import cv2
 

@@ -23,11 +23,11 @@ class HologramLoss(Record):
     efficiency).
 
     With ``signal_window_um``, the error is computed only on pixels within this distance of a pixel whose
-    target is above zero. It ignores light elsewhere (mixed-region amplitude freedom: Pasienski and DeMarco
-    2008, doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the target: ``paper``
-    divides the image by its mean, weighted with the target, and ``least-squares`` multiplies it by the factor
-    that gives the smallest error. The efficiency is the share of the incident power on pixels whose target is
-    above zero.
+    target is above zero. The error ignores light elsewhere (mixed-region amplitude freedom: Pasienski and
+    DeMarco 2008, doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the target:
+    ``paper`` divides the image by its mean, weighted with the target, and ``least-squares`` multiplies it by
+    the factor that gives the smallest error. The efficiency is the share of the incident power on pixels
+    whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(

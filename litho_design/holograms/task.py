@@ -124,7 +124,8 @@ class HologramTask(Task):
         # The advised distance is rounded down, so that no stroke is too fine at this distance.
         near_um = rounded_down(stroke_um / finest_um * optics.distance_um)
         near = optics.model_copy(update={"distance_um": near_um})
-        # At a small distance, some draws of the process window would lie in front of the element.
+        # At a small distance, the image plane of some draws of the process window would lie in front of the
+        # element.
         calm_um = allowed_defocus_um(window, near, self.bench.grid, self.bench.window)
         defocus = "or less" if calm_um == window.defocus_sd_um else f"with --defocus-sd-um {calm_um:.2g}"
         closer = f"--distance-um {near_um:.2g} {defocus}, " if calm_um else ""
@@ -160,7 +161,7 @@ def check_target(target: np.ndarray, layout: LayoutSettings) -> None:
     """Check that a hologram can show a target.
 
     Raises:
-        InputError: the element is too small for its score, or the target does not have the size of the
+        InputError: the element is smaller than the SSIM window, or the target does not have the size of the
             element, has values outside [0, 1], or lacks dark or bright pixels.
     """
     if layout.size_px < SSIM_WINDOW_PX:
