@@ -61,13 +61,14 @@ class ReliefTask(Task):
     and its record.
 
     The inputs ``first_level`` and ``first_print_um``, both of shape (size, size), are the layout of a first
-    print and its measured heights. Every printer predicts the first print with another deviation, and the
-    next print is expected to deviate by the same amount. ``printed`` therefore adds this deviation, so search
-    and scores compare the expected real print with the target itself, as a measurement would.
+    print and its measured heights. The first print deviates differently from the prediction of each printer
+    model, and the next print is expected to deviate from this prediction as the first print did. ``printed``
+    therefore adds this deviation to the prediction, so search and scores compare the expected real print with
+    the target, as a measurement would.
 
     Raises:
         InputError: the start in the settings works only for holograms or lenses, or the spreads of the
-            process window exceed the range of every propagator.
+            process window lead outside the range in which the propagator is valid.
     """
 
     name = "relief"
@@ -91,7 +92,7 @@ class ReliefTask(Task):
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         self._off: dict[Printer, Tensor] = {}
         for one in self.printers:
-            # The search may run its models at a lower precision; the deviation is computed before.
+            # The deviation is computed now, because the search may run its models at a lower precision.
             self._off_um(one)
         if "first_level" in self.inputs:
             self.notes.append(
@@ -169,11 +170,12 @@ class ReliefTask(Task):
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the level of each cell for the start of the search, namely the candidate with the lowest
-        expected loss.
+        """Return the level of each cell from which the search starts: the candidate with the lowest expected
+        loss.
 
-        There are two candidates: for each cell, the level whose wide uniform field would have the target
-        height; and the best affine layout.
+        One candidate is the best affine layout. In the three others, each cell has the level whose wide
+        uniform field would have the target height; they place the relief at the bottom, in the middle and at
+        the top of the printable heights.
         """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self._asked, zero) for zero in _AFFINE_ZEROS]
@@ -186,7 +188,7 @@ class ReliefTask(Task):
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the errors of the two uncorrected layouts, and those of the best levels when they are not
+        """Return the errors of the two uncorrected layouts, and the errors with the best levels that are not
         rounded to integers.
         """
         with torch.no_grad():
@@ -195,9 +197,7 @@ class ReliefTask(Task):
 
     @property
     def _asked(self) -> Tensor:
-        """Return the height map, µm, that the prediction of the model has if the expected print is the
-        target.
-        """
+        """Return the height map, µm, that the model must predict so that the expected print is the target."""
         return self.target - self._off_um(self.printer)
 
     @property
@@ -272,8 +272,8 @@ class ReliefTask(Task):
     def _levels_printing(
         self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5
     ) -> Tensor:
-        """Return one real level per cell, such that the heights of a relief are printed if level k has the
-        height ``level_heights_um[k]``.
+        """Return one real level per cell. These levels print the heights of a relief if level k is printed
+        with the height ``level_heights_um[k]``.
 
         ``zero`` is the position of the relief within the printable heights. At 0, the lowest point of the
         relief is printed with the lowest level; at 1, the highest point is printed with the highest level.
