@@ -67,9 +67,7 @@ def measure_budget(
 
 
 def peak_memory_gib(device: torch.device | None = None) -> float:
-    """Return the peak memory use so far: on a CUDA device, that of the device; otherwise, that of the
-    process.
-    """
+    """Return the peak memory used so far on a CUDA device or, for any other device, by this process."""
     if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB

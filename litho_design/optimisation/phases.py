@@ -126,8 +126,8 @@ def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
     chosen, the constant phase that loses the least light is added to the phase of the lens.
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
-    phase decides which cells fall into this gap. Each constant is judged by the amplitude at the focus, which
-    is the mean of exp(j error) over the cells.
+    phase decides which cells fall into this gap. Each constant is judged by the amplitude at the focus, i.e.
+    by the mean of exp(j error) over the cells.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):

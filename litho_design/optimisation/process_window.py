@@ -40,9 +40,9 @@ class ProcessWindow(Record):
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
     iteration. The search minimises the mean loss over the worst draws; ``tail`` is the share of all draws
-    that count as the worst. The default spreads are guesses; replace them with those of your printer. In one
-    measured data set, the gain varies by 13 % between write fields, but part of this variation comes from the
-    changing scale of the microscope.
+    that count as the worst. The default spreads are guesses; replace them with the spreads of your printer.
+    In one measured data set, the gain varies by 13 % between write fields, but part of this variation comes
+    from the changing scale of the microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -158,7 +158,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
-    # The shortest wavelength allows the least oblique light.
+    # The limit on oblique incidence is lowest for the shortest wavelength.
     shortest = min((draw.optics for draw in drawn), key=lambda one: one.wavelength_um)
     for _, part in coherent_parts(shortest, source.size_um[0]):
         check_incidence(source, part)
@@ -178,9 +178,9 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 def allowed_defocus_um(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
-    """Return the largest spread of the defocus, µm, with which the light of every draw can be propagated:
-    that of ``window``, or a smaller one, rounded down to two digits. It is 0 if the distance itself is too
-    small.
+    """Return the largest spread of the defocus, µm, with which the light of every draw can be propagated.
+    This is the spread in ``window``, or a smaller one, rounded down to two digits; it is 0 if the distance
+    itself is too small.
     """
     drawn = _all_draws(window, optics)
     limit_um = _limit_um(drawn, optics, source, target)
@@ -210,8 +210,8 @@ def _all_draws(window: ProcessWindow, optics: Optics) -> list[Draw]:
 def _limit_um(drawn: Sequence[Draw], optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
     """Return the smallest distance at which the light of every draw can be propagated, µm.
 
-    The angular spectrum has no sampling limit, but the distance must stay positive, so that the image plane
-    lies behind the element.
+    The angular spectrum has no sampling limit, but the distance must be at least the shortest wavelength of
+    all draws, so that the image plane lies behind the element.
     """
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
     if optics.propagation != "rayleigh-sommerfeld":
@@ -291,8 +291,7 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """Return a copy of ``window``, in which the spreads and the correlation of gain and offset are those of
-    measured prints.
+    """Return a copy of ``window`` with the spreads and the correlation of gain and offset of measured prints.
 
     Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound on the
     spread between prints, because it also contains the changing scale of the microscope and the residual of

@@ -36,8 +36,8 @@ class Ranks:
 
     @property
     def part(self) -> str:
-        """Return the text that identifies this process in the names of files of which every process writes
-        its own. It is empty if there is only one process.
+        """Return the text that identifies this process in the names of those files that each process writes
+        separately. It is empty if there is only one process.
         """
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
@@ -46,8 +46,8 @@ class Ranks:
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
 
     def share(self, count: int, rank: int | None = None) -> range:
-        """Divide ``count`` items among the processes, and return the range of those that belong to the
-        process ``rank``, by default to this process.
+        """Divide ``count`` items among the processes, and return the range of the items of the process
+        ``rank``. If no rank is given, this process is meant.
         """
         place = self.rank if rank is None else rank
         return range(count * place // self.count, count * (place + 1) // self.count)

@@ -53,7 +53,7 @@ def search_layout(
     Returns:
         The final state. It contains the levels that were kept (``best_levels``, one per cell) and the
         history. The history has one record per evaluated iteration, with the loss of the sampled layout and
-        that of the printable (argmax) layout.
+        the loss of the printable (argmax) layout.
 
     Raises:
         InputError: the checkpoint in ``folder`` belongs to another task, or the loss is not finite.

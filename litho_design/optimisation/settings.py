@@ -92,7 +92,7 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """The penalty on the disagreement of several models.
 
-    The loss of a search is the largest of the losses according to all models, plus ``weight`` times the
+    The loss of a search is the largest of the losses that the models predict, plus ``weight`` times the
     disagreement of the models, expressed in waves.
     """
 
