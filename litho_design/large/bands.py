@@ -1,4 +1,4 @@
-"""Divide a large element into bands of rows. The element is printed and propagated band by band.
+"""Divide a large element into bands of rows. Its print and the light behind it are computed band by band.
 
 The bands depend only on the layout. An element has the same bands, numbered in the same way, whether one
 process or many compute them.
@@ -77,7 +77,7 @@ class Bands:
         return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
 
     def check_halo(self, halo: int) -> None:
-        """Check that the bands are wide enough, so that no row lies in the halos of two other bands.
+        """Check that the bands have so many rows that no row lies in the halos of two other bands.
 
         Raises:
             InputError: a band has fewer rows than twice the halo, or the last band has fewer rows than the
@@ -112,7 +112,7 @@ class Bands:
 
 
 def require_reach(printer: Printer) -> None:
-    """Check that a printer can print an element in parts.
+    """Check that the print of an element can be predicted in parts.
 
     Raises:
         InputError: according to the printer model, the print at one place depends on the whole layout or on

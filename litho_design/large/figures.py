@@ -1,8 +1,8 @@
 """Score an image of any size, in memory or on disk, one band of rows at a time.
 
-The scores have the same names and meanings as in ``HologramScore``. Scores that need the whole image at once
-are omitted: those of the camera image, those relative to the target blurred to the resolution of the element,
-and the uniformity.
+The scores have the same names and meanings as in ``HologramScore``. Three kinds of scores need the whole
+image at once and are omitted: the score of the camera image, scores relative to the target blurred to the
+resolution of the element, and the uniformity.
 """
 
 from __future__ import annotations

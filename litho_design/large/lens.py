@@ -1,4 +1,4 @@
-"""Design a lens of any size ring by ring: only a strip along one radius is printed and propagated.
+"""Design a lens of any size ring by ring: the print and the light are computed only along one radius.
 
 Light and print are never computed on the whole plane, because an element that is 10 mm wide has 10¹⁰ pixels
 but only 50,000 rings of 0.1 µm.
@@ -60,7 +60,7 @@ class RingLens(DirectLensTask):
     Args:
         settings: settings of the lens. They must state rings, a circular aperture and a thin element.
         printer: a frozen model with a finite reach, or nominal heights.
-        tile_px: length, in pixels, of the tiles in which the strip along the radius is printed.
+        tile_px: length, in pixels, of the tiles in which the print of a strip along the radius is predicted.
 
     Raises:
         InputError: the settings or the printer are not supported for a lens of rings.

@@ -39,8 +39,8 @@ class BandedPropagator:
         bands: bands of the element.
 
     Raises:
-        InputError: the far field is requested, or the Rayleigh-Sommerfeld propagator is, but its kernel is
-            aliased at this distance.
+        InputError: the far field is requested, or the Rayleigh-Sommerfeld propagator is requested although
+            its kernel is aliased at this distance.
     """
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: Device = "cpu"):

@@ -31,7 +31,9 @@ class ElementJob(Job):
     """A print job for a layout that stands alone on the substrate."""
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Surround the layout with a frame of level 0. The write field is as large as the framed layout."""
+        """Surround the layout with a frame of level 0. The write field is as large as the layout without the
+        frame.
+        """
         framed = np.pad(self.level, GUARD_PX)
         return Canvas(framed, pitch_um, self.field_um, max(self.level.shape) * pitch_um)
 

@@ -100,7 +100,7 @@ class Printer(nn.Module):
     @property
     def depends_on_position(self) -> bool:
         """Return True if the print may depend on the position in the write field. This position is unknown if
-        only a patch of a layout is printed.
+        the print of only a patch of a layout is predicted.
         """
         return bool(self.card.get("process_effects"))
 
@@ -127,7 +127,7 @@ class Printer(nn.Module):
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
 
     def print_in_tiles(self, around: Tensor, tile_px: int) -> Tensor:
-        """Print levels tile by tile, and return the height, µm, of shape (b, 1, y, x).
+        """Predict the print of levels tile by tile, and return its height, µm, of shape (b, 1, y, x).
 
         ``around`` contains the levels, extended on all sides by the printer's halo.
 

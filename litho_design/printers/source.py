@@ -111,7 +111,7 @@ def models_at_hand(
     dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
     for name in JUDGES if dataset else ():
-        # Models are selected by their cards, so that those of another printer need not be loaded.
+        # Models are selected by their cards, so that models of another printer need not be loaded.
         card = zoo.card(name)
         if (card.get("dataset") or {}).get("sha256") != dataset:
             continue

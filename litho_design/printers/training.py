@@ -123,8 +123,8 @@ def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
 
     Two errors are added in quadrature: the error on the prints in the model's card, and the scatter of the
     gains of these prints times ``relief_um``. If the relief is higher than these prints, the first error is
-    scaled up. Errors are assumed to be normally distributed, so the mean absolute error is sqrt(2 / pi) times
-    the rms error. If the card has no prints, the result is 0.
+    scaled up. The card states mean absolute errors; they are multiplied by sqrt(pi / 2) to obtain rms errors,
+    because errors are assumed to be normally distributed. If the card has no prints, the result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:
