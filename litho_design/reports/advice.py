@@ -60,8 +60,8 @@ def called(printer: str) -> str:
 
 
 def distribution_warning(design: Design) -> str:
-    """Return a warning if the layout of a design is far from the model's training layouts, or if this
-    distance is unknown.
+    """Return a warning if the layout of a design is far from the model's training layouts, or if its distance
+    from them is unknown.
 
     Otherwise, return an empty text.
     """

@@ -88,8 +88,8 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """Return a sentence that compares the value of the main score that the design expected with its values
-    according to the judging models.
+    """Return a sentence that compares the main score that was predicted in the design with the main scores
+    that the judging models predict.
 
     The sentence is empty if fewer than two models judge.
     """

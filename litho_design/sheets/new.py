@@ -68,7 +68,7 @@ def new_sheet(
         settings: settings of both versions of the hologram, by default those of ``small_hologram``. All
             fields of the sheet have the size, pitch and number of levels of the hologram.
         layouts: number of random layouts from which the printer model is learned.
-        seed: seed of these random layouts.
+        seed: seed of the random layouts.
         device, announce: as for ``design_hologram``.
 
     Raises:

@@ -115,8 +115,8 @@ def design_lens(
     tile_px: int | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout of a lens so that its print focuses light (direct task), or so that images of
-    objects can be reconstructed behind it (computational task).
+    """Optimise the layout of a lens so that its print focuses light (direct task), or so that objects can be
+    reconstructed from the images behind it (computational task).
 
     Args:
         model: as for ``design_hologram``.
@@ -126,9 +126,9 @@ def design_lens(
             drawings.
         held_out_objects: pictures, or folders of pictures, that are used only for the scores and not in the
             search (see ``with_objects``).
-        tile_px: if given, only the rings of a focusing lens are designed: a strip along one radius is printed
-            in tiles of this many pixels. The whole plane is not computed, so the lens may be 10 mm wide or
-            more. The model must have a finite reach.
+        tile_px: if given, only the rings of a focusing lens are designed: the print of a strip along one
+            radius is predicted in tiles of this many pixels. The whole plane is not computed, so the lens may
+            be 10 mm wide or more. The model must have a finite reach.
         how: see ``How``.
 
     Returns:
@@ -171,8 +171,8 @@ def correct(
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction that was printed and measured.
-        scan: measurement of this first print. The next print is expected to deviate from the prediction of
-            each model in the same way as the first print did.
+        scan: measurement of the print of the first correction. The next print is expected to deviate from the
+            prediction of each model in the same way as the first print did.
         how: see ``How``; ``robust`` is True by default.
 
     Returns:

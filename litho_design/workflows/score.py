@@ -1,4 +1,4 @@
-"""Score a finished design with independent judges, and write the folder of the score."""
+"""Score a finished design by models, a measured print or a photograph, and write the folder of the score."""
 
 from __future__ import annotations
 
@@ -47,8 +47,10 @@ def score(
             ``scan`` is also given, the photograph of an object is deconvolved with the PSF of the measured
             print too.
         element: ``thin``, or ``thick`` to compute the light behind every print by the wave propagation
-            method. By default, the kind that the design states. Ignored if ``design`` is already loaded.
-        band_px: if given, a large hologram is printed and scored in bands of at most this many rows.
+            method. By default, the kind stated in the design is used. The argument is ignored if ``design``
+            is already loaded.
+        band_px: if given, the print of a large hologram is predicted and scored in bands of at most this many
+            rows.
         device: where prints and waves are computed; ignored if ``design`` is already loaded.
         extrapolate: accept heights beyond the range for which a judge was calibrated; the result records this
             choice.
