@@ -78,7 +78,7 @@ def errors_table(result: CloseLoop) -> str:
         rows,
         f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans. Only "
         "k terms are fitted to a scored scan, on pixels that are not scored. Brackets contain 95 % "
-        "bootstrap intervals over scans.",
+        "intervals from resampling scans.",
     )
 
 
@@ -88,7 +88,7 @@ def causes_table(result: CloseLoop) -> str:
         [
             "effect",
             "groups of scans",
-            "strengths (95 % interval over prints)",
+            "strengths (95 % interval from the scatter between prints)",
             "change of error without it",
             "scans improved",
             "looks like",

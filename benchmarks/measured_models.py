@@ -71,13 +71,14 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         heads,
         rows,
         f"Mean absolute error on {len(split['scored_ids'])} held-out scans ({split['folds']} folds of scans, "
-        f"seed {split['seed']}; {_steps_text(benchmark)}). Brackets contain 95 % bootstrap intervals over "
-        f"scans. The {len(split['lock_box'])} locked scans belong to no fold and affect no number here. The "
-        "k terms of each scan are fitted to pixels that are not scored. Levelling leaves in all maps the "
-        "same smooth background, whose five coefficients are fitted to the training scans. It is added to "
-        "predictions of measured maps, but not to designs. The noise is an upper estimate "
-        "([how](../../noise.md)), and its intervals are over prints. A better model can remove at least the "
-        "part of an error that exceeds the noise. For each model, this part at k = 1 and at k = 7 is: "
+        f"seed {split['seed']}; {_steps_text(benchmark)}). Brackets contain 95 % intervals from "
+        f"resampling scans. The {len(split['lock_box'])} locked scans belong to no fold and affect no number "
+        "here. The k terms of each scan are fitted to pixels that are not scored. Levelling leaves in all "
+        "maps the same smooth background, whose five coefficients are fitted to the training scans. It is "
+        "added to predictions of measured maps, but not to designs. The noise is an upper estimate "
+        "([how](../../noise.md)), and its intervals come from resampling prints. A better model can remove "
+        "at least the part of an error that exceeds the noise. For each model, this part at k = 1 and at "
+        "k = 7 is: "
         f"{_above(benchmark, floor)}.",
     )
 
@@ -104,8 +105,8 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
         "folds. Each scan is predicted by a model not trained on it, plus the smooth background of that "
         "model's training scans. Then k terms are fitted to each scan, on pixels that are not scored. "
-        "Brackets: 95 % intervals over scans. For what the layout cannot explain, they are over "
-        "the 6 prints and include errors common to a place, field or print.",
+        "Brackets: 95 % intervals from resampling scans; in the row of what the layout cannot explain, "
+        "from resampling the 6 prints. This row includes errors common to a place, field or print.",
     )
 
 
@@ -127,7 +128,7 @@ def noise_table(noise: dict[str, Any]) -> str:
         ],
         f"The noise is computed from the residuals of `{budget['model']}` at all scored pixels of "
         f"{noise['run']['n_scans']} unlocked scans of the measured prints. Brackets contain 95 % intervals "
-        "over prints.",
+        "from resampling prints.",
     )
     by_level = markdown_table(
         ("level", "pixels", "σ where flat", "MAE where flat"),
