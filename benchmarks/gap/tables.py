@@ -98,7 +98,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
     told = f"{seeds} seed{'s' * (seeds > 1)}"
-    head = f"### {TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}."
+    head = f"### {TITLES[name]}\n\n{task['iterations']} iterations for every design, {told}."
     if ceiling:
         reached = ", ".join(f"{LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
         head += f" A continuous phase on the same grid, without printer or levels, reaches {reached}."

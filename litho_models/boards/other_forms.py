@@ -275,7 +275,7 @@ def _overshoot(rng: Rng) -> Law:
 
 @_form("blur-with-height", "surface", "1/µm", 2.0)
 def _blur_with_height(rng: Rng) -> Law:
-    """Share, per µm of height, of the surface that is replaced by the surface blurred over 0.5–1 µm."""
+    """Share of the surface, per µm of height, that is replaced by a copy blurred over 0.5–1 µm."""
     reach_um = rng.uniform(0.5, 1)
 
     def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -290,8 +290,8 @@ def _blur_with_height(rng: Rng) -> Law:
 
 @_form("blur-across-field", "surface", "1", 1.0)
 def _blur_across_field(rng: Rng) -> Law:
-    """Share of the surface that is replaced by the surface blurred over 0.7–1.2 µm at one side of the field;
-    the share falls to 0 at the opposite side.
+    """Share of the surface, at one side of the field, that is replaced by a copy blurred over 0.7–1.2 µm; the
+    share falls to 0 at the opposite side.
     """
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
