@@ -17,8 +17,8 @@ designs = {
 
 # %% [markdown]
 # `without` was designed for a perfect printer, and `with` through a model trained on measured prints. How
-# good a design looks to its own model proves nothing. Let a model that was not used for either design print
-# both elements, and look at the images:
+# good a design looks to its own model proves nothing. Let a model that was used for neither design predict
+# both prints, and score their images:
 
 # %%
 judged = {
