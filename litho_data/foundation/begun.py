@@ -1,7 +1,7 @@
 """Rules for commands that write their result as a folder: how they declare, begin, continue and finish this
 result.
 
-A command first declares its result: the name of its record file, which is written last, and the fields of
+A command first declares two things: the name of its record file, which it writes last, and the fields of
 this record that determine the result. The folder is then in one of four states:
 
 =========  =======================================  ==========================================================

@@ -47,7 +47,7 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
             the package, because importing the subpackage or module would bind that name to it.
         file: the package's ``__init__`` file; every name that it imports with ``as`` is public.
 
-    ``__version__`` is always one of the names. It is the version of the distribution, or ``"0"`` if the
+    ``__version__`` is always among the public names. It is the version of the distribution, or ``"0"`` if the
     distribution is not installed.
     """
     homes = {

@@ -167,8 +167,8 @@ def _lock(stream: IO[str], wait: bool = False) -> bool:
 
 
 def _remove_unless_held(left: Path) -> None:
-    """Remove a partial file that a stopped process left. A file that is locked is still being written, and
-    stays.
+    """Remove a partial file that a stopped process left. A locked file is still being written, so
+    it is kept.
     """
     with contextlib.suppress(FileNotFoundError), open(left) as stream:
         if _lock(stream):

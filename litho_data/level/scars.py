@@ -90,8 +90,9 @@ def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:
-    """Return the prominence of each pixel: the largest prominence of all ridges that contain the pixel and
-    are at most ``max_width_px`` rows wide.
+    """Return, for each pixel, the largest prominence of the ridges that contain it and are at most
+    ``max_width_px`` rows wide. In each column, the prominence of a ridge is its lowest height minus the
+    higher of the two pixels above and below it.
     """
     ny = z.shape[0]
     prominence = np.zeros_like(z)

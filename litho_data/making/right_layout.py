@@ -129,7 +129,7 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Yield the scans whose heights fit another layout of the dataset better than the layout onto which they
-    were registered. Each is yielded as its id and the reason.
+    were registered: for each scan, its id and a message that says what is wrong.
     """
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
@@ -160,8 +160,8 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Yield the scans that are mirrored relative to their layout, and the scans whose rotation differs from
-    that of most scans. Each is yielded as its id and the reason. Scans for which the card states that the
-    print was rotated are ignored.
+    that of most scans: for each scan, its id and a message that says what is wrong. Scans for which the card
+    states that the print was rotated are ignored.
     """
     upright = [one for one in prints if not one.turned]
     usual, count = Counter(one.dihedral for one in upright).most_common(1)[0] if upright else ("", 0)
@@ -176,8 +176,8 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Yield the scans whose height per level differs clearly from that of their own group (dose or print) and
-    is closest to that of another group, and the scans whose doses seem to be swapped. Each is yielded as its
-    id and the reason.
+    is closest to that of another group, and the scans whose doses seem to be swapped: for each
+    scan, its id and a message that says what is wrong.
     """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1

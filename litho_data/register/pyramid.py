@@ -122,7 +122,8 @@ def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
     """Return the warp of the kind ``model`` that approximates a given warp best.
 
     If ``model`` is affine, the result agrees with the given warp to first order at the centre of the field.
-    For a simpler kind, the result is fitted to the positions to which the given warp maps the corners.
+    For a simpler kind, the given warp moves the four corners, and the result is fitted to their new
+    positions.
     """
     if model == "homography":
         return matrix

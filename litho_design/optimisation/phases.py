@@ -41,13 +41,13 @@ def gerchberg_saxton(
     Each step replaces the propagated amplitude inside the output window by the target amplitude and keeps the
     wave outside the window unchanged. The adjoint of the propagator carries this correction back to the
     element, and the corrected wave is projected onto the waves that phases of the cells can produce in the
-    given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P the
-    propagator, a the target amplitude and Pi the projection. The norm of P is at most one, so each step
-    minimises an upper bound of the squared amplitude error, and the error never rises (Gerchberg and Saxton
-    1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target amplitude
-    where light is missing. This form improves uniformity but loses the guarantee that the error never rises.
-    The initial phases are drawn at random within one radian of pi. The phase pi is the middle of the range if
-    the levels span a full wave.
+    given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P is the
+    propagator, ``a`` is the target amplitude, and Pi is the projection. The norm of P is at most one, so each
+    step minimises an upper bound of the squared amplitude error, and the error never rises (Gerchberg and
+    Saxton 1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target
+    amplitude where light is missing. This form improves uniformity but loses the guarantee that the error
+    never rises. The initial phases are drawn at random within one radian of pi. The phase pi is the middle of
+    the range if the levels span a full wave.
 
     Args:
         propagator: propagator with an adjoint, such as ``RSPropagator``, on square grids with the pixel pitch

@@ -24,8 +24,8 @@ class Width(Record):
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
         figure: name of the main score, which is the first headline score of the task.
         less: True if the main score is better when lower.
-        loss_unit: factor that converts the loss to the unit of the main score. It is given only if the loss
-            is an error that includes the expected error of the model's prediction; otherwise, it is None.
+        loss_unit: factor that converts the loss to the unit of the main score. It is set only if the loss
+            already contains the expected error of the model's prediction; otherwise, it is None.
         level_heights_um: for each model, the printed height of a wide uniform field of each level.
     """
 

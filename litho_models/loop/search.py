@@ -129,7 +129,7 @@ def describe(
 
 
 def with_table(state: State, table: Cause) -> State:
-    """Add a table to a model, and refit all parameters of the model."""
+    """Add an effect from ``TABLES`` to a model, and refit all parameters of the model."""
     twin = state.twin.with_effect(table.name, table.by, table.values)
     return fit_state(twin, state.study, from_here=True)
 

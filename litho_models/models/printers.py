@@ -16,8 +16,8 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 class PrinterConfig(SimulatorConfig):
     """Configuration of a printer: its parts, in the order in which they act, and the values of their
-    parameters. For a fitted parameter, the value is its starting value; any other parameter keeps this value.
-    The name of a parameter has the form ``part.parameter``.
+    parameters. A fitted parameter starts at its value; any other parameter stays at its value. The name of a
+    parameter has the form ``part.parameter``.
 
     Each parameter can also be set like a field of the configuration, under this name, such as
     ``spot.sigma_um``.

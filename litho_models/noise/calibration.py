@@ -131,8 +131,8 @@ class SpreadAnalysis(Record, extra="ignore"):
 
 
 class Stated(NamedTuple):
-    """The stated distribution of the residuals of one scan. ``scale_nm`` is the scale of the distribution at
-    each pixel, and ``tails`` is the shape of the distribution.
+    """The distribution that a model of the noise predicts for the residuals of one scan. ``scale_nm`` is its
+    scale at each pixel, and ``tails`` is the shape of the distribution.
     """
 
     scale_nm: Array

@@ -237,9 +237,9 @@ class Chosen(NamedTuple):
     """The ways to make and scan prints that were chosen to decide one question, or all questions.
 
     ``ways`` lists the scans that are made of each print. Successive prints cycle through ``places``, the
-    positions in the write field, and through ``doses``, the relative doses. ``tried`` contains the
-    separations of the rivals in standard deviations, keyed by a description of the experiment: one plain
-    scan, or a plain scan together with another way to scan or print.
+    positions in the write field, and through ``doses``, the relative doses. ``tried`` contains
+    the separation of the two most similar rivals, in standard deviations, for each experiment that was tried,
+    keyed by a description of the experiment.
     """
 
     ways: tuple[Way, ...]

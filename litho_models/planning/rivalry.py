@@ -59,7 +59,8 @@ class Way:
 class PlannedPrint:
     """One planned print (a printed field) and its scans.
 
-    ``level`` contains the levels of the layout and has shape (ny, nx). The levels may be rounded or not.
+    ``level`` contains the levels of the layout and has shape (ny, nx). The levels need not be whole
+    numbers.
     ``ways`` lists the ways in which the print is scanned, one per scan. ``place`` is the position in the
     write field. ``order`` is the position in the writing order, from -0.5 (first) to 0.5 (last). ``dose`` is
     relative to earlier prints.
