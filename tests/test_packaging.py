@@ -111,7 +111,6 @@ def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_pat
     assert "](https://raw.githubusercontent.com/owner/name/v1/docs/results/first/first.jpg)" in page
 
 
-TODAY = datetime.date.today().isoformat()
 # These scripts replace the Python that builds the wheel (BUILDS) and the Pythons that try it (TRIES).
 BUILDS = """#!/bin/sh
 case "$1" in -c) echo 9.8.7;; *) mkdir -p dist; touch dist/litholoop-9.8.7-py3-none-any.whl;; esac
@@ -139,14 +138,17 @@ exit {code}
 def released(
     folder: Path,
     *,
-    said: str = TODAY,
+    said: str | None = None,
     cited: str = "9.8.7",
     tag: str = "",
     change: str = "",
     checks: int = 0,
     **of_312: object,
 ) -> tuple[int, str]:
-    """Release a small project in ``folder``, and return the exit code and the last line of the output."""
+    """Release a small project in ``folder``, and return the exit code and the last line of the output. The
+    project states the date ``said``, or that of today.
+    """
+    said = said or datetime.date.today().isoformat()
     files = {
         ".venv/bin/python": BUILDS,
         ".gitignore": ".venv/\nbin/\ndist/\nlog\ntmp/\n",
