@@ -56,8 +56,8 @@ def test_the_page_on_the_store_quotes_the_uncertainty_of_the_measured_heights():
     unclear = sum(float(scan["sigma_levelling_nm"]) == 0 for scan in scans)
     assert f"the median of `sigma_nm` is {middle('sigma_nm')} nm" in page
     assert (
-        f"(`sigma_levelling_nm`: {middle('sigma_levelling_nm')}). {unclear} of the {len(scans)} scans show "
-        f"no clear surface. Pixels ({middle('sigma_pixel_nm')}), lines ({middle('sigma_line_nm')}), "
-        f"resampling ({middle('sigma_resampling_nm')}) and registration "
+        f"(`sigma_levelling_nm`: {middle('sigma_levelling_nm')}). In {unclear} of the {len(scans)} scans, "
+        f"this bow is not significant. Pixels ({middle('sigma_pixel_nm')}), "
+        f"lines ({middle('sigma_line_nm')}), resampling ({middle('sigma_resampling_nm')}) and registration "
         f"({middle('sigma_registration_nm')})"
     ) in page
