@@ -11,4 +11,5 @@ def assert_close(found: torch.Tensor, wanted: torch.Tensor, rtol: float = 1e-6, 
     ``atol`` plus ``rtol`` times the wanted value.
     """
     assert (found.dtype, found.shape) == (wanted.dtype, wanted.shape)
-    np.testing.assert_allclose(found.detach().numpy(), wanted.detach().numpy(), rtol=rtol, atol=atol)
+    values = found.detach().numpy(), wanted.detach().numpy()
+    np.testing.assert_allclose(*values, rtol=rtol, atol=atol, equal_nan=False)

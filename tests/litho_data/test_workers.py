@@ -166,6 +166,8 @@ for address in {addresses}:
         main()
     except SystemExit as end:
         assert end.code == 2
+    else:
+        raise AssertionError(address)
 """
         command = [sys.executable, "-c", program]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
