@@ -5,7 +5,6 @@ from their nominal to their true positions.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -87,7 +86,7 @@ class Bend:
         """
         u, v = (np.clip(one, -1, 1) for one in self.unit(x, y))
         terms = _terms(u, v, self.degree)
-        along_x, along_y = (_weighted_sum(row, terms) for row in self.amount)
+        along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
         return along_x, along_y
 
     def straighten(self, points: Array) -> Array:
@@ -103,9 +102,9 @@ class Bend:
         at_x, at_y = x, y
         for _ in range(_STEPS):
             shift_x, shift_y = self.shift(at_x, at_y)
-            last_x, last_y, at_x, at_y = at_x, at_y, x - shift_x, y - shift_y
-            squared = ((at_x - last_x) ** 2 + (at_y - last_y) ** 2).max()
-            if not squared > (_SETTLED * self.half.min()) ** 2:
+            step = np.hypot(x - shift_x - at_x, y - shift_y - at_y).max()
+            at_x, at_y = x - shift_x, y - shift_y
+            if not step > _SETTLED * self.half.min():
                 break
         return at_x, at_y
 
@@ -150,34 +149,8 @@ class Bend:
 def _terms(u: Array, v: Array, degree: int) -> list[Array]:
     terms = [u * u - 1 / 3, u * v, v * v - 1 / 3]
     for k in range(3, degree + 1):
-        terms += [_legendre(k, one) for one in (u, v)]
+        terms += [np.polynomial.legendre.legval(one, [0.0] * k + [1.0]) for one in (u, v)]
     return terms
-
-
-def _legendre(k: int, x: Array) -> Array:
-    """Return the Legendre polynomial P_k of every value, for k of at least 2.
-
-    The function does the operations of ``numpy.polynomial.legendre.legval``, with results identical to the
-    last bit. It does them in place, which takes half the time.
-    """
-    low: Any = -(k - 1) / k
-    high = x * ((2 * k - 1) / k)
-    for n in range(k - 1, 1, -1):
-        lower = high * (-(n - 1) / n)
-        high *= x
-        high *= (2 * n - 1) / n
-        high += low
-        low = lower
-    high *= x
-    high += low
-    return high
-
-
-def _weighted_sum(weights: Array, terms: list[Array]) -> Array:
-    total = weights[0] * terms[0]
-    for weight, term in zip(weights[1:], terms[1:], strict=True):
-        total += weight * term
-    return total
 
 
 def fit_bent_affine(
