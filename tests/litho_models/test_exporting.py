@@ -15,6 +15,7 @@ from litho_models import build_model, load_frozen, save_frozen
 from litho_models.cli.app import app
 from litho_models.frozen.exporting import LARGEST_DIFFERENCE_UM, export_model
 from litho_models.frozen.simulator import FrozenSimulator
+from tests.tensors import assert_close
 
 SIZE_PX = 48
 FEW = {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep_um": (0.3,)}
@@ -63,7 +64,7 @@ def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> No
     facts = {"card.json": ""}
     program = torch.export.load(tmp_path / "model.pt2", extra_files=facts).module()
     # This layout was not used for the export.
-    torch.testing.assert_close(program(layout(5)), model(layout(5)), atol=LARGEST_DIFFERENCE_UM, rtol=0)
+    assert_close(program(layout(5)), model(layout(5)), atol=LARGEST_DIFFERENCE_UM, rtol=0)
     assert json.loads(facts["card.json"])["pitch_um"] == model.pitch_um
 
 
