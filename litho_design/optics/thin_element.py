@@ -116,7 +116,8 @@ class Optics(Record):
 
 
 def check_incidence(grid: PixelGrid, optics: Optics) -> None:
-    """Check that the incident light has a real angle at every pixel, and that the pixels sample its phase.
+    """Check that the sine of the angle of incidence is below 1 at every pixel, and that the pixels are small
+    enough to sample the phase of the incident light.
 
     The sine of the angle at a pixel is the sine of the oblique incidence plus, for a near point source, the
     sine of the ray from this source.

@@ -290,7 +290,7 @@ def _blur_with_height(rng: Rng) -> Law:
 
 @_form("blur-across-field", "surface", "1", 1.0)
 def _blur_across_field(rng: Rng) -> Law:
-    """Share of the surface, at one side of the field, that is replaced by a copy blurred over 0.7–1.2 µm; the
+    """Share of the surface that is replaced by a copy blurred over 0.7–1.2 µm, at one side of the field. The
     share falls to 0 at the opposite side.
     """
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))

@@ -1,5 +1,5 @@
-"""PBL: physics-based learning, the main simulator of the paper. PBL models the known steps of the process by
-formulas and the unknown steps by networks.
+"""PBL: physics-based learning, the main simulator of the paper. PBL describes the known steps of the process
+with formulas and the unknown steps with networks.
 
 PBL is a chain of five steps:
 

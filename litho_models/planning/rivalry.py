@@ -226,7 +226,7 @@ class Rivalry:
             start = twin = self.twins[other]
             prior = np.array(self.question.rivals[other].information)
             for number in range(rounds):
-                here = self._linearise(twin, prints, None) if number else first[other]
+                here = self._linearise(twin, prints) if number else first[other]
                 linear = [
                     replace(part, residual=part.residual + _flat(wanted))
                     for part, wanted in zip(here, predicted[true], strict=True)
@@ -290,7 +290,7 @@ class Rivalry:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
     def _linearise(
-        self, twin: Twin, prints: Sequence[PlannedPrint], known: Sequence[Fields] | None
+        self, twin: Twin, prints: Sequence[PlannedPrint], known: Sequence[Fields] | None = None
     ) -> list[Linearised]:
         """Linearise the predictions of a model for each scan of the prints. The residual in the result is
         minus the predicted height; the caller must add the target of the fit. ``known`` is a cache of
