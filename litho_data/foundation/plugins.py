@@ -10,7 +10,7 @@ import inspect
 import linecache
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
     Raises:
         InputError: a file is not Python, or a plug-in fails to load.
     """
-    for point in metadata.entry_points(group=GROUP):
+    for point in _installed(*sys.path):
         version = point.dist.version if point.dist else ""
         _load(point.name, version, point.load)
     for file in files:
@@ -40,6 +40,14 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
         if path.suffix != ".py" or not path.is_file():
             raise InputError("plug-in", got=str(file), wanted="a Python file")
         _load(str(path), file_sha256(path)[:12], lambda path=path: _import(path))  # type: ignore[misc]
+
+
+@lru_cache(maxsize=1)
+def _installed(*path: str) -> metadata.EntryPoints:
+    """Return the entry points of the plug-ins that are installed in the folders of ``path``, which is
+    ``sys.path``. To read those of all packages takes as long as a small job of a worker.
+    """
+    return metadata.entry_points(group=GROUP)
 
 
 def plugin_files() -> list[str]:

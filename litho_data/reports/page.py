@@ -237,6 +237,7 @@ def sentences(template: Path, about: str, one: object) -> str:
     return " ".join(getattr(_plain(template).module, about)(one).split())
 
 
+@cache
 def _plain(template: Path) -> jinja2.Template:
     import jinja2
 
