@@ -101,8 +101,8 @@ def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
 def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
-    """Train one model for each fold on the scans outside this fold, and one model on all scans. The layouts
-    are those that the loop predicts from, i.e. they are multiplied by the doses of the scans.
+    """Train one model for each fold on the scans outside this fold, and one model on all scans. Before the
+    training, each layout is multiplied by the dose of its scan, as everywhere in the loop.
 
     Args:
         scans: the scans.

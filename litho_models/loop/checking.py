@@ -83,12 +83,13 @@ class Check:
         return replace(cause, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """Return the name of another law or cause in the model whose formula this cause may merely correct.
-        The name is empty if there is no such law or cause.
+        """Test whether this cause may merely correct an error in the formula of another law or cause in the
+        model. Return the name of this other effect, or an empty text if there is none.
 
-        The other effect must gain more than ten times as much as this cause. If the other effect is a law,
-        this is sufficient, because every law is approximate. If it is a cause, there is a second condition:
-        variants of the change that the other effect makes must gain at least half as much as this cause.
+        The gain of the other effect must be more than ten times the gain of this cause. If the other effect
+        is a law, this is sufficient, because every law is approximate. If it is a cause, there is a second
+        condition: without this cause, variants of the change that the other effect makes must reduce the
+        error by at least half of the gain of this cause.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -101,9 +102,10 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Reject a cause that passed the checks of ``of`` if short laws in its place fit better.
+        """Compare a cause with short laws that are put in its place. Reject the cause if the laws fit better.
+        It must have passed the checks of ``of`` before.
 
-        At most two laws are put in its place. Together, they have no more parameters than the cause.
+        There are at most two laws. Together, they have no more parameters than the cause.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
@@ -117,10 +119,11 @@ class Check:
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Reject a cause that passed the checks of ``of`` if a table explains more.
+        """Compare a cause with a table that is put in its place. Reject the cause if the table explains more.
+        It must have passed the checks of ``of`` before.
 
-        The cause is rejected if two conditions hold: a table in its place gains more than twice as much as
-        the cause, and held-out scans do not confirm the cause when it is added to the model with this table.
+        The cause is rejected if two conditions hold: the gain of the table is more than twice the gain of the
+        cause, and held-out scans do not confirm the cause when it is added to the model with this table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -135,7 +138,8 @@ class Check:
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
         """Return the law with the largest predicted gain among the laws with at most ``numbers`` parameters.
-        Return None if all of them would gain much less than the cause.
+        Return None if the predicted gain of each of them is much smaller than the gain of the cause that is
+        checked.
         """
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
@@ -149,8 +153,8 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Return the decrease of the squared error on held-out scans, nm², if variants of the change that a cause
-    makes to the prediction are added to the model.
+    """Add variants of the change that a cause makes to the prediction. Return the resulting decrease of the
+    squared error on held-out scans, nm².
 
     Args:
         without: model without the cause.

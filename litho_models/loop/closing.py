@@ -47,8 +47,7 @@ class Closed:
         base_name: name of the chosen base model.
         rivals: results of the search for causes with each of the other base models, keyed by model name.
         plain: the chosen base model, fitted to the original scans.
-        base: the chosen base model, fitted to corrected scans. From these scans, the measurement errors that
-            the scans of a group share were subtracted.
+        base: the chosen base model, fitted to the corrected scans (see ``study``).
         named: result of the search for causes, after all checks.
         lawful: result of the search for short laws, which are added to the model with the causes.
         described: result of the search for tables, which are added to the model with the causes and laws. A
@@ -76,8 +75,8 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the corrected scans, from which the measurement errors that the scans of a group share were
-        subtracted.
+        """Return the corrected scans. Measurement errors that all scans of a group have in common are
+        subtracted from them.
         """
         return self.base.study
 
@@ -93,8 +92,9 @@ class Closed:
 
     @cached_property
     def rests(self) -> dict[str, Rest]:
-        """Return the part of the residual that features of layout and position can still explain after each
-        stage of the loop, keyed by stage (``base``, ``causes``, ``laws``, ``tables``).
+        """Return the part of the residual that features of layout and position can still explain. The result
+        is keyed by the stage of the loop: ``base``, ``causes``, ``laws`` or ``tables``. A stage that did not
+        change the model is left out.
         """
         added = {"causes": self.named, "laws": self.lawful, "tables": self.described}
         stages = {"base": self.base} | {stage: found.state for stage, found in added.items()}
@@ -177,15 +177,14 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 def with_answer(
     closed: Closed, cause: Cause | None, name: str, values: Mapping[str, float], **known: Any
 ) -> Closed:
-    """Replace a cause or law in the result of a loop by the effect that remains possible after the comparison
-    with later prints, and return the new result. The models that contain the cause are fitted again with this
-    effect in its place.
+    """Replace a cause or law in the result of a loop by the effect that later prints leave possible. Return
+    the new result. Each model that contains the cause is fitted again with this effect in its place.
 
     Args:
         closed: the result.
         cause: the cause or law to replace, or None if the effect is added as a further cause.
         name: name of the effect, which may be the cause itself.
-        values: parameter values of the effect from which its fits start.
+        values: starting values of the parameters of the effect.
         known: the fields ``alike``, ``excluded`` and ``role`` of the new `Cause`.
     """
     if cause and cause.name == name:
@@ -226,8 +225,8 @@ def _rest_beside(start: State) -> Callable[[State], Rest]:
 
 
 def freed_scans(state: State) -> list[PrintedScan]:
-    """Subtract from each scan the measurement errors that the scans of its group share. Return the corrected
-    scans.
+    """Subtract from each scan the measurement errors that all scans of its group have in common. Return the
+    corrected scans.
 
     Errors that are common to all scans are not subtracted, so they can still be attributed to a cause. The
     errors that are subtracted from a scan are learned from the scans outside its fold.
@@ -257,7 +256,8 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 
 
 def _simplest(searches: Mapping[str, Found]) -> str:
-    """Choose the simplest base model among those with nearly the smallest error.
+    """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
+    them is chosen.
 
     For each base model, count the causes that the search found with this base model but not with all others.
     The model with the fewest such causes is the simplest. If several models have the same number, the one
@@ -277,11 +277,11 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
     """Search for laws and then for tables that the model with the causes still lacks. Then check each cause
-    in a model that also contains the laws and, if one of the tables gains more than all causes together, this
-    table.
+    in a model that also contains the laws. If a table gains more than all causes together, this model
+    contains the table, too.
 
     A cause that fails its check is removed, and the search for laws and tables is repeated without it. Return
-    two results: that of the search for laws, and that of the search for tables.
+    the result of the search for laws and the result of the search for tables.
 
     Args:
         start: the fitted base model.

@@ -40,7 +40,7 @@ class Fit(NamedTuple):
 
     @property
     def numbers(self) -> tuple[int, int]:
-        """Return the number of fitted parameters of the printer model, and that of the measurement model."""
+        """Return the numbers of fitted parameters of the printer model and of the measurement model."""
         return len(self.twin.vector), self.measurement.numbers
 
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
@@ -80,14 +80,13 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Return the errors of predicted maps for each reported policy, i.e. for each set of terms that are
-    fitted to single scans and subtracted. For films, only the policy without fitted terms is reported.
+    """Return the errors of predicted maps, one row per policy. A policy is a set of terms that are fitted to
+    each scan and subtracted before the error is computed. For films, the only policy has no such terms.
 
     Args:
         scans: the scans.
         maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
-        numbers: number of fitted parameters of the printer model, and number of those of the measurement
-            model.
+        numbers: numbers of fitted parameters of the printer model and of the measurement model.
         seed: seed of the calibration blocks.
         terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``. The last two have
             defaults.
@@ -138,9 +137,9 @@ class HeldOut:
         the corrected model.
 
         Each scan is predicted by a fit to the scans outside its fold. If the base is refitted and prints were
-        scanned several times, the base model and the corrected model are scored a second time. Each scan is
-        then predicted by a fit that leaves out all scans of the same print. The base model with the causes is
-        listed only if it differs from both other models.
+        scanned several times, there is a second score of the base model and of the corrected model. For this
+        score, each scan is predicted by a fit that leaves out all scans of the same print. The base model
+        with the causes is listed only if it differs from both other models.
         """
         plain, causes = closed.plain, closed.named.state
         numbers = len(plain.twin.vector)
@@ -213,8 +212,8 @@ class HeldOut:
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, plain: State, maps: Maps) -> Maps:
-        """Add to each predicted map the smooth background that is learned from the scans of the other folds,
-        as in the published protocol.
+        """Add to each predicted map a smooth background, which is learned from the scans of the other folds.
+        The benchmark predicts measured maps in the same way.
         """
         found = list(maps)
         for twin, (rest, own) in zip(plain.per_fold, self.study.folds, strict=True):

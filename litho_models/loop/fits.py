@@ -87,7 +87,7 @@ class Study:
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
-        """Return for each fold the indices of the scans outside the fold and those of the scans inside it."""
+        """Return two lists of scan indices per fold: the scans outside the fold, and the scans inside it."""
         own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
@@ -97,7 +97,7 @@ class Study:
 
     @property
     def windows(self) -> list[PreparedScan]:
-        """Return the window of each scan, which is the part that fits and screening use."""
+        """Return the window of each scan, i.e. the part of the scan that is used for fits and screening."""
         return [scan.window for scan in self.scans]
 
     @property
@@ -130,7 +130,8 @@ class State:
     Attributes:
         twin: the model fitted to all scans.
         per_fold: for each fold, the model fitted without the scans of this fold.
-        linear: linearised problem of each window at the parameters of ``twin``: residual, derivatives and
+        linear: for each window (the part of a scan that is used for fits), the least-squares problem
+            linearised at the parameters of ``twin``. It consists of the residual, the derivatives and the
             free terms.
         held_out_um: residual of each window at its n sampled pixels, µm, of shape (n,). The prediction is
             made by the model that was fitted without the fold of this window.
@@ -224,9 +225,9 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     Args:
         twin: the model.
         study: the scans.
-        from_here: whether to start only from the current parameters of the model. Otherwise, two starts are
-            tried: the current parameters, and the same with the default parameters of the base. The start
-            that leads to the smaller error is used.
+        from_here: whether to start only from the current parameters of the model. Otherwise, a second start
+            is also tried, in which the parameters of the base have their default values. The start that leads
+            to the smaller error is used.
     """
     windows = study.windows
     start = twin.vector if from_here else _best_start(twin, windows)
@@ -248,14 +249,14 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Return the better of two starts of a fit: the current parameters, or the current parameters with those
-    of the base replaced by their defaults.
+    """Return the better of two starts of a fit. The first start has the current parameters. In the second
+    start, the parameters of the base have their default values instead.
 
     The better start is the one from which a fit to some of the scans reaches the smaller error.
 
-    Two starts are tried because the parameters of a base that was fitted without an effect have absorbed part
-    of this effect. When the effect is added, a fit from the current parameters may therefore get stuck in a
-    local optimum.
+    The second start is tried for the following reason: if a base was fitted without an effect, its parameters
+    have absorbed part of this effect. When the effect is added, a fit from these parameters may therefore get
+    stuck in a local optimum.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):

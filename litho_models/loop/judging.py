@@ -44,7 +44,7 @@ class Judgement:
         before_nm2: mean squared error before the change.
         gain_nm2: mean decrease of the squared error.
         gains_nm2: decrease of the squared error of each scan, of shape (scans,).
-        p: one-sided p value of the sign-flip test on the evidence of the scans.
+        p: one-sided p value of the sign-flip test over the scans.
         low_nm2: lower end of the confidence interval of the mean gain.
     """
 
@@ -56,14 +56,17 @@ class Judgement:
 
     @property
     def improved(self) -> tuple[int, int]:
-        """Return the number of scans whose error falls, and the total number of scans."""
+        """Return two numbers: how many scans have a smaller error after the change, and how many scans there
+        are.
+        """
         return int((self.gains_nm2 > 0).sum()), len(self.gains_nm2)
 
     def reason(self, by: str = ALL) -> str:
         """Return the reason why the held-out scans do not confirm the change. The text is empty if they
         confirm it.
 
-        ``by`` is the grouping by which the strength of the change differs.
+        ``by`` is the grouping of the scans by which the strength differs, or ``all`` if it is the same in all
+        scans.
         """
         better, count = self.improved
         if count < FEWEST_SCANS:
@@ -85,8 +88,8 @@ def judge(
     Args:
         before_nm2, after_nm2: mean squared error of each scan before and after the change, of shape (scans,).
         study: the study, which provides the seed.
-        evidence_nm2: mean product of the change and of the residual before the change in each scan, of shape
-            (scans,). By default, the decreases of the squared error are used instead.
+        evidence_nm2: one number per scan for the sign-flip test, as returned by the function
+            ``evidence_nm2``, of shape (scans,). By default, the decreases of the squared error are used.
     """
     gains = before_nm2 - after_nm2
     low, _ = bootstrap_interval(gains.tolist(), seed=study.seed)
@@ -101,19 +104,19 @@ def judge_states(before: State, after: State) -> Judgement:
 
 
 def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
-    """Return the mean product of a change and the residual before this change. Pixels that were not measured
-    are ignored.
+    """Multiply the change of a prediction by the residual before this change, pixel by pixel. Return the mean
+    of the product, nm². Pixels that were not measured are ignored.
 
     Args:
-        before_um, after_um: residual before and after the change.
+        before_um, after_um: residual before and after the change, µm.
     """
     return NM_PER_UM**2 * float(np.nanmean(before_um * (before_um - after_um)))
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
     """Return whether another change of the model is clearly worse than the best change. Two conditions must
-    hold: the other change is worse in nearly every scan, and its gain is smaller than the best gain by at
-    least a quarter of the best gain.
+    hold: a sign-flip test over the scans shows that the other change is worse, and its gain is at most three
+    quarters of the best gain.
 
     Args:
         before_nm2, best_nm2, other_nm2: mean squared error of each scan before the change, after the best

@@ -1,8 +1,8 @@
 """Estimate by a cross-validated ridge regression how much of a residual could still be learned.
 
 The ridge regression uses features of layout and position. It names no cause and is not part of any model. It
-shows whether the residual has structure that could be learned, and how large this structure is compared with
-the gain of a cause.
+shows whether the residual has structure that could be learned, and by how much the error would then decrease.
+This decrease can be compared with the decrease that a cause achieves.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Rest:
 
     @cached_property
     def ci95_nm2(self) -> tuple[float, float] | None:
-        """Return the 95 % confidence interval of the mean over scans of ``gains_nm2``. Return None if there
-        are fewer than six scans.
+        """Return the 95 % confidence interval of the mean of ``gains_nm2``, or None if there are fewer than
+        six scans.
         """
         return interval(self.gains_nm2.tolist())
 
@@ -74,8 +74,7 @@ class Rest:
     @property
     def matters(self) -> bool:
         """Return whether a relevant part of the residual can be learned. This is the case if the ridge
-        regression explains more than 1 % of the squared error and the confidence interval of its gain lies
-        above zero.
+        regression explains more than 1 % of the squared error and the interval ``ci95_nm2`` lies above zero.
         """
         low, _ = self.ci95_nm2 or (0.0, None)
         return self.share > SMALLEST_SHARE and low > 0
@@ -178,10 +177,11 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
 
 
 def _splines(size: int) -> np.ndarray:
-    """Return five cubic splines, which add up to 1, along an axis with ``size`` pixels. They divide the part
-    of the axis from which fits take their pixels. The result has shape (5, size).
+    """Return five cubic splines along an axis with ``size`` pixels. Their sum is 1 at every pixel, and their
+    knots divide the part of the axis that is used for fits. The result has shape (5, size).
 
-    Outside this part, the splines are constant, because no pixel of the fit would determine them there.
+    Outside this part, the splines are constant, because the fit has no pixels there that could determine
+    them.
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])

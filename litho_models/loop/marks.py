@@ -32,12 +32,12 @@ def with_marks(
     """Return the findings about per-scan terms together with those about marks.
 
     Args:
-        findings: the findings about per-scan terms. The bends of the scans are added to the finding about the
-            registration, because the registration has straightened the scans.
+        findings: the findings about per-scan terms. One of them is about the registration. The number of bent
+            scans is added to it, because the registration has straightened these scans.
         scans: the original scans.
         maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
-        rounding_um: step, µm, to which the heights in the raw file of each scan are rounded; empty if there
-            are no raw files.
+        rounding_um: rounding step of the heights in the raw file of each scan, µm; empty if there are no raw
+            files.
     """
     found = [_with_bends(one, scans) if one.name == "registration-residual" else one for one in findings]
     found.append(_scars(scans, maps_um))
@@ -45,8 +45,8 @@ def with_marks(
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
-    """Return the step to which the heights of a raw scan are rounded, µm. Apart from a common offset, all
-    heights are multiples of this step. Return 0 if there is no such step.
+    """Return the rounding step of the heights of a raw scan, µm. Apart from a common offset, all heights are
+    multiples of this step. Return 0 if there is no such step.
     """
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
     steps = np.diff(heights)
@@ -108,8 +108,8 @@ def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> tuple[int, int]:
 
 
 def _with_bends(finding: ScanFinding, scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Add to the finding about the registration how many bent scans it has straightened. All other steps of
-    the loop use the straightened scans.
+    """State in the finding about the registration how many scans were bent. The registration has straightened
+    them, and all other steps of the loop use the straightened scans.
     """
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
     text = f"{finding.evidence}; the registration straightened {len(found_um)} of {len(scans)} scans"

@@ -128,8 +128,8 @@ class Twin:
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """Return the slots of all fitted parameters of effects. They are in the order of these parameters in
-        ``vector``, where the parameters of the base come first.
+        """Return the slots of all fitted parameters of effects. They have the same order as in ``vector``,
+        where they follow the parameters of the base.
         """
         return [
             Slot(name, key, label)
@@ -158,8 +158,8 @@ class Twin:
         return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
-        """Return the twin for predicting the scans of a fold. If the base was trained once for each fold, it
-        has the base that was trained without this fold. Otherwise, it is the twin itself.
+        """Return the twin that predicts the scans of a fold. If one base was trained for each fold, the twin
+        gets the base that was trained without this fold. Otherwise, the twin is returned unchanged.
         """
         base = self.base
         return replace(self, base=base.models[fold]) if isinstance(base, FoldedBase) else self
@@ -189,8 +189,8 @@ class Twin:
         return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
     def values(self, label_in: Mapping[str, str] = {}) -> dict[str, dict[str, float]]:
-        """Return the parameter values of all effects, in the order in which the effects act, for scans with
-        the given labels. If no label is given for a grouping, the mean over its groups is used.
+        """Return the parameter values of all effects for scans with the given labels. If no label is given
+        for a grouping, the mean over its groups is used. The effects are in the order in which they act.
 
         Args:
             label_in: label of the scans in each grouping, keyed by the name of the grouping.
@@ -204,9 +204,9 @@ class Twin:
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """Return the twin with only those strengths that the given scans can determine. The strengths of the
+        """Return the twin without strengths that the given scans cannot determine. The strengths of the
         groups to which these scans belong are kept. The strengths of every other group are replaced by the
-        means of the kept strengths.
+        means of the kept strengths, or by values without effect if none is kept.
         """
         effects = {}
         for name, one in self.effects.items():
@@ -249,8 +249,8 @@ class Twin:
         Args:
             scan: the scan.
             extra: parameter values of a further effect to try, keyed by the name of the effect.
-            known: cache of intermediate fields of this scan, which twins with the same base have already
-                computed. Newly computed fields are added to this cache.
+            known: cache of intermediate fields of this scan. Twins with the same base can share it. Newly
+                computed fields are added to it.
         """
         chain, context = self.chain(scan, extra), scan.context
         return chain(context.layout_um, context, known, self.numbers.tobytes())[0, 0].numpy()

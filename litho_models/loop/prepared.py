@@ -23,14 +23,16 @@ from litho_models.splits.folds import Crop
 # quadrant is predicted with a margin.
 LARGE_PX = 400
 _MARGIN_PX = 48
-# Number of pixels of each scan that fits and screening use. Residuals are correlated over about 5 px, so more
-# pixels would add little information.
+# Number of pixels of each scan that are used for fits and screening. Residuals are correlated over about 5
+# px, so more pixels would add little information.
 _SAMPLED_PX = 16384
 
 
 @dataclass(frozen=True, repr=False)
 class ExposedScan(PrintedScan):
-    """A scan whose layout is what was exposed: the nominal height times ``exposure``, the relative dose."""
+    """A scan with its exposed layout. This is the nominal layout times ``exposure``, the relative dose of the
+    scan.
+    """
 
     exposure: float = 1.0
 
@@ -41,9 +43,9 @@ class ExposedScan(PrintedScan):
 
 
 def exposed(scan: PrintedScan) -> PrintedScan:
-    """Return the scan with the layout that the loop predicts from. A smaller dose acts like a lower layout. A
-    scan without a dose, or with a dose of 1, is returned unchanged, so that cached fits to this scan stay
-    valid.
+    """Multiply the layout of a scan by its dose, because a smaller dose acts like a lower layout. The loop
+    predicts from the result. A scan without a dose, or with a dose of 1, is returned unchanged, so that
+    cached fits to this scan stay valid.
     """
     return scan if scan.dose in (None, 1) else ExposedScan(**vars(scan), exposure=float(scan.dose))
 
@@ -57,7 +59,7 @@ class PreparedScan:
         context: facts about the scan that effects use, such as the exposed layout and the position in the
             write field.
         line: index of the scan line of each pixel, of shape (ny, nx).
-        number: number of the scan, on which the choice of its ``window`` depends.
+        number: number of the scan. It determines which quadrant of the scan becomes its ``window``.
     """
 
     stored: PrintedScan
@@ -78,8 +80,8 @@ class PreparedScan:
 
     @cached_property
     def sample(self) -> np.ndarray:
-        """Return the flat indices of the n pixels that fits and screening use. These pixels are a thinned
-        selection of the measured pixels that are not near the edge.
+        """Return the flat indices of the n pixels that are used for fits and screening. They are a thinned
+        selection of the measured pixels away from the edge of the scan.
         """
         return thinned(self._inner, _SAMPLED_PX)
 
@@ -90,8 +92,8 @@ class PreparedScan:
 
     @cached_property
     def window(self) -> PreparedScan:
-        """Return the part of the scan that fits and screening use: a quadrant if the scan is large, and
-        otherwise the whole scan.
+        """Return the part of the scan that is used for fits and screening. It is a quadrant if the scan is
+        large, and otherwise the whole scan.
 
         Successive scans use different quadrants, so that together they cover the whole field. A quadrant with
         few measured pixels is replaced by the quadrant that has the most measured pixels.
@@ -187,9 +189,9 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans, in addition to the prepared scans ``known``. The scaled positions of the further
-    scans in the writing order are interpolated between those of the known scans, so that all scans are on the
-    same scale.
+    """Prepare further scans, in addition to the prepared scans ``known``. The position of each further scan
+    in the writing order is interpolated between the scaled positions of the known scans, so that all scans
+    have the same scale.
     """
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
     prepared = []
@@ -200,9 +202,10 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 
 def sample_border_px(size: int) -> int:
-    """Return the number of pixels that fits leave out at each edge of a scan. The neighbourhood of these
-    pixels extends beyond the layout. ``size`` is the length of the shorter axis.
+    """Return the width of the border of a scan that is left out of fits, in pixels. The pixels in this border
+    have neighbours outside the layout. ``size`` is the length of the shorter axis of the scan.
 
-    Errors are nevertheless scored on all pixels, as in the benchmark (``NuisanceProtocol.border_px``).
+    The border is left out only of fits. Errors are scored on all pixels, as in the benchmark
+    (``NuisanceProtocol.border_px``).
     """
     return min(8, size // 8)

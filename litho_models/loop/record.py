@@ -44,8 +44,8 @@ class ErrorRow(Record):
         measurement: what was added to the predicted print. ``print alone`` adds nothing, ``published`` adds
             the smooth background of the training scans (the published protocol), and ``shared`` adds the
             changes of the whole measurement model.
-        policy: name of the policy, i.e. of the set of terms that were fitted to each scan, on pixels that are
-            not scored.
+        policy: name of the policy, which is a set of terms. These terms were fitted to each scan, using only
+            pixels that are not scored.
         k: effective number of these terms.
         held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
             the held-out scans were used neither for the fits nor for any choice, such as which effects to
@@ -119,16 +119,18 @@ class FoundEffect(Record):
         confusable_with: other effects that look the same in these scans.
         separating_experiment: experiments that would distinguish these effects.
         gain_nm2: decrease of the squared error of held-out scans when the effect is added to a model with all
-            other effects. The error is computed on the pixels that fits use, after seven terms and an affine
-            registration error have been subtracted from each scan.
+            other effects. The error is computed on the pixels that are used for fits, after seven terms and
+            an affine registration error have been subtracted from each scan.
         before_nm2: squared error of held-out scans without the effect, computed in the same way.
-        scans_improved: number of held-out scans whose error falls, and total number of scans.
+        scans_improved: number of held-out scans with a smaller error after the effect is added, and total
+            number of scans.
         p_confirm: p value of the sign-flip test of the effect on held-out scans.
         family_p: p value of the effect in the screening of all candidates, corrected for the number of
             candidates.
         group_p: p value of the grouping, computed by permuting the labels of the scans; None if the strength
             does not differ by group.
-        left_out_nm: increase of the mean absolute error (k = 1) if the effect is removed from the model.
+        left_out_nm: increase of the headline error (see ``ErrorRow.is_headline``) if the effect is removed
+            from the model.
         survives_on: names of the other base models with which the search also found the effect, or an effect
             that looks the same.
     """
@@ -201,9 +203,10 @@ class Planted(Record):
     copies.
 
     ``amount`` is the planted strength. ``rms_nm`` is the rms of the change that the planted effect makes,
-    after the free terms of each scan have been fitted to this change and subtracted. ``named`` is the set of
-    indistinguishable effects that contains the planted effect; it is empty if the loop found no such set.
-    ``found`` is the fitted strength; it is None if the effect is not in the model.
+    after the free terms of each scan have been fitted to this change and subtracted. ``named`` lists the
+    cause that the loop found and the effects that look the same. It is empty if the planted effect is not
+    among them, or if another base model with as few parameters does not need the cause. ``found`` is the
+    fitted strength; it is None if the effect is not in the model.
     """
 
     name: str
@@ -243,7 +246,7 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """The decision that new prints allow on an open question.
+    """The answer to an open question, as far as new prints can decide it.
 
     ``declared`` lists the possible answers, which were stated before these prints were made, and ``left``
     lists the answers that are still possible. ``prints`` and ``scans`` are the numbers of new prints and of
@@ -267,9 +270,10 @@ class CloseLoop(Result):
     Attributes:
         errors: the errors of all models on held-out scans, one row per model, policy and kind of held-out
             scans.
-        gain_nm: the headline error of the base model minus that of the corrected model (see
-            ``ErrorRow.is_headline``). ``over_scans`` and ``over_prints`` contain its confidence intervals.
-        decisions: decisions on the open questions of this store, based on the prints of further stores.
+        gain_nm: decrease of the headline error (see ``ErrorRow.is_headline``) from the base model to the
+            corrected model. ``over_scans`` and ``over_prints`` contain the confidence intervals of this
+            decrease.
+        decisions: answers to the open questions of this loop, decided with the prints of further stores.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -306,8 +310,8 @@ class CloseLoop(Result):
     ) -> ErrorRow | None:
         """Return the error with the given properties, or None if this error was not computed.
 
-        By default, ``policy`` is the usual policy, in which one offset is fitted to each scan, or nothing for
-        films.
+        By default, ``policy`` is the usual policy: one offset is fitted to each scan. For films, nothing is
+        fitted.
         """
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out

@@ -22,8 +22,9 @@ def write_report(
     Args:
         result: the record of the loop.
         scans: the scans for development.
-        maps_um: the maps that these scans are expected to show, µm, of shape (ny, nx): first those before the
-            correction of the model, then those after it.
+        maps_um: two lists of maps that these scans are expected to show, µm, of shape (ny, nx). The base
+            model predicts the maps of the first list, and the corrected model predicts the maps of the second
+            list.
         folder: folder to which the files are written.
     """
     page = Page(
@@ -104,8 +105,8 @@ def write_report(
 
 
 def said(about: str, one: object) -> str:
-    """Return the text that a macro of ``sentences.jinja`` makes for an object. ``about`` is the name of the
-    macro, such as ``verdict`` (for a result), ``effect``, ``decision`` or ``measurement``.
+    """Describe an object in words. The text is made by a macro of ``sentences.jinja``. ``about`` is the name
+    of the macro, such as ``verdict`` (for a result), ``effect``, ``decision`` or ``measurement``.
     """
     return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 

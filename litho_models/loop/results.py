@@ -1,5 +1,5 @@
-"""Make the record of a loop. It states the errors of the models, the strengths of the effects that were
-found, with confidence intervals, and the reasons why the other effects were rejected.
+"""Make the record of a loop. It contains the errors of the models, the effects that were found, and the
+rejected effects. The strengths of the effects have confidence intervals, and each rejection has a reason.
 """
 
 from __future__ import annotations
@@ -100,8 +100,9 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the fitted values of the single parameters of the base model, keyed by name. The values are in
-    physical units if these are known. The result is empty if the base model was not fitted.
+    """Return the fitted values of the parameters of the base model, keyed by name. Arrays of parameters are
+    left out. The values are in physical units if these are known. The result is empty if the base model was
+    not fitted.
     """
     base, found = twin.fitted_base, {}
     if twin.own and isinstance(base, Simulator):
@@ -146,8 +147,9 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """Return the fitted values of the parameters of an effect, keyed by the name of the parameter. Their
-    confidence intervals are computed from the scatter over prints, or over scans if there are too few prints
-    or if only one print has this strength. A strength of a single scan has no interval.
+    confidence intervals are computed from the scatter over prints. The scatter over scans is used instead if
+    there are too few prints, or if the strength applies to only one print. If it applies to only one scan,
+    there is no interval.
     """
     twin, scans = closed.final.twin, closed.study.scans
     kinds = [independent(scans), [scan.id for scan in scans]]
@@ -204,7 +206,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
-    """State for every effect that was not added why it was not.
+    """List the effects that were not added to the model, each with the reason.
 
     Args:
         closed: the loop.

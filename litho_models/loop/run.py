@@ -84,11 +84,12 @@ def close_loop(
         seed: seed of the folds, the calibration blocks and the permutations.
         workers: number of local processes.
         dask: address of a Dask scheduler to use instead of local processes.
-        further: function that receives the closed loop and its findings about per-scan terms. It returns the
-            loop to record, which it may have changed, decisions on open questions, and further records.
+        further: function that receives the closed loop and its findings about per-scan terms. It returns
+            three values: the loop to record, the decisions on open questions, and a list of further records.
+            The returned loop may differ from the one received.
         decided_by: hashes of the further stores that the function ``further`` uses. They are recorded in the
             settings.
-        left_out: texts that name the scans of the further stores that are left out, with the reason.
+        left_out: for each scan of the further stores that is not used, a text with its name and the reason.
         report: function that receives the progress messages.
 
     Raises:
@@ -162,7 +163,9 @@ def close_loop(
 
 
 def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
-    """Return two lists: the scans with enough measured pixels, and texts that name the other scans."""
+    """Return two lists: the scans with enough measured pixels, and for each other scan a text with its name
+    and the reason.
+    """
     scans = store.scans()
     few = [scan.id for scan in scans if np.count_nonzero(scan.usable) < FEWEST_PIXELS]
     usable = [scan for scan in scans if scan.id not in few]
@@ -193,8 +196,8 @@ def _nested(
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the step to which the heights in the raw file of each scan are rounded, µm. The list is empty
-    if the store has no raw files.
+    """Return the rounding step of the heights in the raw file of each scan, µm. The list is empty if the
+    store has no raw files.
     """
     try:
         return [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
@@ -204,7 +207,7 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
     """Save the corrected model as a frozen model, i.e. with fixed parameters. If the strength of an effect
-    differs by group, the strength of the group of the latest scan is used.
+    differs by group, it is fixed at its value for the group that contains the latest scan.
     """
     base = closed.final.twin.fitted_base
     base = base.common if isinstance(base, FoldedBase) else base

@@ -42,9 +42,10 @@ PERMUTATIONS = 199
 @dataclass(frozen=True)
 class Trial:
     """Parameter sets of one effect that are tried together. The sets have the same values of the shape
-    parameters and differ only in which amplitudes are switched on. A regression fits a multiple of each set.
+    parameters and differ only in which amplitudes are switched on. A regression fits one factor per set,
+    which multiplies the change that the set makes.
 
-    ``columns`` contains the column numbers of these parameter sets in the inner products of all trials.
+    Each set gives one column of the regression. ``columns`` contains the numbers of these columns.
     """
 
     effect: Effect
@@ -71,8 +72,8 @@ class Trial:
         has been multiplied by its factor in ``multiples``, which has shape (…, sets). With ``axis`` -1, each
         multiple is judged by itself.
 
-        An amplitude on the wrong side is attributed to noise and ignored if it is small relative to the
-        largest amplitude in all groups.
+        If an amplitude on the wrong side is small relative to the largest amplitude, it is attributed to
+        noise and ignored. The largest amplitude is taken over all groups, unless ``axis`` is -1.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -80,8 +81,8 @@ class Trial:
         return ~(wrong & (sizes > 0.3 * sizes.max(axis=axis, keepdims=True))).any(axis=axis)
 
     def reach(self, multiples: np.ndarray) -> np.ndarray:
-        """Return for each multiple the largest factor, at most 1, by which the steps of all amplitudes can be
-        multiplied so that the amplitudes stay within their ranges.
+        """Return a factor for each multiple. If the steps of all amplitudes are multiplied by it, the
+        amplitudes stay within their ranges. It is the largest such factor, but at most 1.
 
         The full steps may lead out of the ranges, because they are obtained by linear extrapolation.
         """
@@ -170,8 +171,8 @@ class Secants:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """The result of screening a trial with strengths that differ by one grouping. It contains the gain that
-    is predicted for held-out scans.
+    """The result of screening a trial with one grouping of the scans. It contains the gain that is predicted
+    for held-out scans, and tests of this gain.
 
     Attributes:
         trial: the parameter sets that were tried.
@@ -181,13 +182,15 @@ class Screened:
         multiples: the factors by which the parameter sets of the trial are multiplied, keyed by group label.
             They are fitted to all scans.
         allowed: whether the fitted amplitudes lie on physically possible sides of their null values.
-        retained: fraction of the squared norm of the columns that remains after the scan terms and the
-            changes that the model's own parameters can make have been projected out.
+        retained: fraction of the squared norm of the columns that remains after a projection. The scan terms
+            and the changes that the model's own parameters can make are projected out.
         beside_base: the same fraction if only the scan terms are projected out.
-        family_p: p value of the candidate: the fraction of sign flips of the gains of the scans after which
-            at least one candidate gains as much as this one.
-        group_p: p value of the grouping: the fraction of random permutations of the scans after which at
-            least one grouping gains as much as this one. None if no grouping was tested.
+        family_p: p value of the candidate. The signs of the gains of the scans are flipped many times. The p
+            value is the fraction of these flips in which the gain of at least one candidate reaches the gain
+            of this one.
+        group_p: p value of the grouping. The scans are permuted at random. The p value is the fraction of
+            these permutations in which the gain with at least one grouping reaches the gain with this one.
+            None if no grouping was tested.
     """
 
     trial: Trial
@@ -225,7 +228,8 @@ class Screening:
         state: the fitted model.
         effects: the candidate effects, none of which is in the model.
         secants: changes that the candidates make to the predictions of a similar model. If they are given,
-            they are used in place of those for the fitted model, which then need not be computed.
+            they are used as approximations, and the changes of the predictions of the fitted model are not
+            computed.
         beside_own: whether the changes that the model's own parameters can make are projected out of the
             columns of the candidates.
     """
@@ -308,8 +312,8 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Return the candidate with the best grouping of its strength. Return None if no grouping gains
-        significantly more than a strength that is the same in all scans.
+        """Return the candidate with the best grouping of its strength. Return None if its gain is not
+        significantly larger than with a strength that is the same in all scans.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         options = {
@@ -323,8 +327,8 @@ class Screening:
         return replace(own[best[0]], group_p=best[1]) if best else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
-        """Return the cosine of the angle between the changes that two candidates make to the predictions of
-        all scans, taken together as one vector.
+        """Return the cosine of the angle between the changes that two candidates make to the predictions. The
+        changes in all scans form one vector per candidate.
         """
         # The change that a candidate makes is a weighted sum of columns. ``factors`` contains the weights of
         # the columns in each scan.
@@ -335,7 +339,7 @@ class Screening:
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def strengths(self, labels: Labels, columns: Sequence[int]) -> dict[str, np.ndarray]:
-        """Return the strengths of the columns that are fitted to all scans, keyed by label."""
+        """Fit the strengths of the columns to all scans of each group. Return them keyed by group label."""
         products, members = self._products(columns), np.array(labels)
         return {one: _solved(products[members == one].sum(axis=0)) for one in dict.fromkeys(labels)}
 
@@ -346,14 +350,14 @@ class Screening:
     def gains_by(
         self, groupings: Sequence[Labels] | np.ndarray, columns: Sequence[int], trial: Trial | None = None
     ) -> np.ndarray:
-        """Return the gain on each scan, nm², for columns whose strengths differ by label and are fitted
-        without the fold of this scan. The result has shape (groupings, scans).
+        """Return the gain of the given columns on each scan, nm², of shape (groupings, scans). The strengths
+        of the columns differ by label, and they are fitted without the fold of the scan.
 
         Args:
             groupings: one or more groupings, each with the label of each scan.
             columns: numbers of the columns in the inner products.
-            trial: trial with these columns, whose strengths stay within the ranges of its amplitudes. A
-                strength that is not allowed gains nothing.
+            trial: trial with these columns. If it is given, strengths are reduced so that its amplitudes stay
+                within their ranges. If a strength is not allowed, its gain is 0.
         """
         products, labels, fold_of = self._products(columns), np.array(groupings), self.study.fold_of
         # The strengths for a scan are fitted to the scans with the same label in other folds. If there are no
@@ -368,20 +372,20 @@ class Screening:
     def best_grouping(
         self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, np.ndarray], np.ndarray]
     ) -> tuple[str, float] | None:
-        """Choose a grouping of the scans by which strengths differ. Among the groupings whose gains are
-        nearly the largest, the one with the fewest parameters is chosen.
+        """Choose the grouping of the scans by which the strengths of a candidate differ. Only groupings with
+        nearly the largest gain are considered. Of these, the one with the fewest parameters is chosen.
 
         Args:
             options: gain in nm² and number of parameters of each grouping, keyed by the name of the grouping.
-            gains_of: function ``gains_of(by, moved)`` that returns the gains, nm², of the candidate for the
-                grouping ``by`` if its strengths differ by each of the groupings ``moved`` instead. The gains
-                have shape (groupings, scans).
+            gains_of: function ``gains_of(by, moved)``. It takes the candidate for the grouping ``by`` and
+                lets its strengths differ by each of the groupings ``moved`` instead. It returns the gains,
+                nm², of shape (groupings, scans).
 
         Returns:
-            The name of the chosen grouping, and its p value: the fraction of random permutations of the scans
-            after which any grouping gains as much. Permutations that reproduce the chosen grouping are not
-            counted. The result is None if no grouping has a gain, or if the gain of the chosen grouping is
-            not significant.
+            The name of the chosen grouping, and its p value. This is the fraction of random permutations of
+            the scans in which the gain with any grouping is as large. Permutations that reproduce the chosen
+            grouping are not counted. The result is None if no grouping has a gain, or if the gain of the
+            chosen grouping is not significant.
         """
         most = max((gain for gain, _ in options.values()), default=0.0)
         close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}

@@ -44,7 +44,8 @@ class Cause:
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
         corrects: whether the effect was rejected because it may merely correct the formula of another effect.
         excluded: effects that look the same in these scans, but that later prints exclude.
-        role: role of the effect that later prints decided on; None if they did not decide on it.
+        role: role of the effect (``process`` or ``measurement``, for example), if later prints decided it;
+            otherwise None.
     """
 
     name: str
@@ -99,9 +100,10 @@ def search(
         candidates: effects that may be added.
         most: largest number of effects in the result.
         secants: changes that the candidates make to the predictions of a similar model. If they are given,
-            they are used in place of those for the current model, which then need not be computed.
-        seed: result of the same search with another base model. If it is given, the search starts with those
-            effects in this result that are confirmed with this base model, too.
+            they are used as approximations, and the changes of the predictions of the current model are not
+            computed.
+        seed: result of the same search with another base model. If it is given, its effects are tested with
+            this base model. The search starts with those that held-out scans confirm.
     """
     found = Found(start)
     if seed and seed.causes:
@@ -117,8 +119,8 @@ def search(
 def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Find tables that held-out scans confirm as an addition to a model. Each table is judged separately, by
-    a linear fit, and is not added to the model. At most ``most`` tables are judged.
+    """Return the tables that, according to held-out scans, would improve a model. Each table is judged alone,
+    by a linear fit, and is not added to the model. At most ``most`` tables are judged.
     """
     found: list[Cause] = []
     for one in Screening(state, tables, secants).standing()[:most]:
@@ -245,7 +247,7 @@ def _fit(job: tuple[str, Twin, Study]) -> State:
 
 
 def same_change(before: State, one: State, other: State) -> bool:
-    """Return whether two changes of a model change the predictions of held-out scans in nearly the same way.
+    """Return whether two changes of a model have nearly the same effect on the predictions of held-out scans.
 
     Args:
         before: the model before the change.

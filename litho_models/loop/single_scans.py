@@ -100,7 +100,8 @@ class SingleScans:
         )
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
-        """Test whether the scan lines, or the rows of the layout, have height offsets.
+        """Test whether the heights contain offsets of whole lines. The lines are scan lines or rows of the
+        layout.
 
         The offsets of scan lines are compared with those of rows. Both are also compared with offsets of the
         layout's columns, which serve as a control. Scans are slightly rotated relative to their layouts.
@@ -179,8 +180,8 @@ class SingleScans:
 def coefficients(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], own: Terms, terms: Terms
 ) -> np.ndarray:
-    """Fit all ``terms`` to each scan, and return the k coefficients of those terms that are in ``own``. The
-    result has shape (scans, k).
+    """Fit all ``terms`` to each scan. Return only the k coefficients of the terms in ``own``, as an array of
+    shape (scans, k).
 
     Coefficients of displacements are in µm.
     """
@@ -197,8 +198,8 @@ def coefficients(
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
     """Judge a per-scan term by whether the two halves of each scan agree on it.
 
-    Counting the scans whose error falls would not be a suitable test, because the error of a scan whose term
-    is near zero does not fall.
+    It would not be a suitable test to count the scans with a smaller error: if the term of a scan is near
+    zero, the error of this scan does not decrease.
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
