@@ -1,6 +1,6 @@
-"""For each open question of a plan, compute how much the rivals (competing explanations) differ, and the
-power (the probability that the planned prints decide the question correctly). Also list all possible
-outcomes.
+"""For each open question of a plan, compute the difference between the rivals (competing explanations) and
+the power, which is the probability that the planned prints decide the question correctly. Also list all
+possible outcomes.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     The decision compares the squared errors of the two rivals. If one rival is true, the expected difference
     of the squared errors is the squared distance between the two predictions. The actual difference varies
     about this value for two reasons. One is the noise, projected onto the difference of the predictions. The
-    other is that the squared distance varies between prints, with the relative spread ``question.spread``. As
-    in the decision, the part of the difference that an error of ``form_nm`` in the form of the model may
-    explain is subtracted.
+    other is that the squared distance varies between prints, with the relative spread ``question.spread``. An
+    error of ``form_nm`` in the form of the model may explain a part of the difference. This part is
+    subtracted, as in the decision itself.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -58,9 +58,9 @@ def of_repeats(prints: int, scans: int) -> float:
     In this experiment, every print is remounted and scanned several times.
 
     The test is the F test of an analysis of variance. The term is attributed to the printer if the scans of
-    one print agree better than expected by chance (p <= 0.005). It is attributed to the microscope if they
-    agree less well than expected for an effect of the printer (p <= 0.005). The smaller of the powers of
-    these two tests is returned.
+    one print agree better than expected by chance (p <= 0.005). It is attributed to the microscope if these
+    scans agree less well than expected for an effect of the printer (p <= 0.005). The two tests have
+    different powers, and the smaller power is returned.
     """
     if prints < 2 or scans < 2:
         return 0.0
@@ -94,18 +94,19 @@ def prints_needed(powers: Sequence[float]) -> int | None:
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Return by how many standard deviations of the noise a gain (difference of two squared errors) exceeds
-    the allowance for the error of the model itself. The result is 0 if it does not exceed this allowance.
+    """Subtract from a gain (difference of two squared errors) an allowance for the error of the model itself.
+    Return the rest in standard deviations of the noise. The result is 0 if the gain does not exceed the
+    allowance.
 
     Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose that
     A is true except for noise n and an error e in the form of the model, which both rivals share. Prints then
     show y = A + e + n, and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> -
     2<D, n>. The noise averages out over prints, but e recurs in every print of similar texture. The angle
     between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference of up to 2 |D| |e|
-    is inconclusive, and no number of prints separates rivals with |D| below 2 |e|. There is a second
-    allowance, which is derived from the new prints: without e and without noise, the gain would be |D|². If
-    the gain falls below |D|² by more than the noise explains, this shortfall therefore also counts as an
-    error of the model. The larger of these two allowances is used.
+    is inconclusive, and no number of prints separates rivals with |D| below 2 |e|. A second allowance is
+    derived from the new prints. Without e and without noise, the gain would be |D|². If the gain is smaller,
+    the part of the shortfall that noise does not explain also counts as an error of the model. The larger of
+    the two allowances is used.
 
     Args:
         gain: |y - B|² - |y - A|², where A is the rival that fits better.
@@ -143,8 +144,8 @@ def of_rivals(
 
     Args:
         rivalry: the rivals of the question.
-        tried: separation of the two most similar rivals, in standard deviations, for each way to print and
-            scan that was tried, keyed by a description of this way.
+        tried: results for the ways to print and scan that were tried, keyed by a description of the way. Each
+            result is the separation of the two most similar rivals, in standard deviations.
         planned: planned prints on which the rivals are compared.
         random: the same prints with random layouts.
         prints: number of prints in the plan.
@@ -190,9 +191,9 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Compare all pairs of rivals on the given prints. Either rival of a pair may be the true one; of these
-    two cases, the one with the smaller power is used. The power is averaged over random draws of the
-    parameters of the rivals.
+    """Compare all pairs of rivals on the given prints. Either rival of a pair may be the true one. The power
+    is computed for both cases, and the smaller power is returned. In each case, the power is averaged over
+    random draws of the parameters of the rivals.
     """
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
@@ -218,8 +219,8 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
 def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
-    """Plan how to answer a question for which the layouts do not matter. Its answer depends only on the way
-    in which prints are scanned, or on a fact that is missing in the dataset card.
+    """Plan how to answer a question for which the layouts do not matter. Such a question is answered by
+    scanning prints in a certain way, or by adding a missing fact to the dataset card.
 
     Args:
         question: the question.

@@ -79,13 +79,13 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Derive the limits from earlier prints. The lowest allowed level is the first one that, together
-        with all levels below it, covers at least a thousandth of the area of these prints. The highest
-        allowed level is found in the same way, counting from the top. Structures must not be finer than those
-        in these prints.
+        """Derive the limits from earlier prints. Very rare levels at both ends are excluded: the levels below
+        the lowest allowed level together cover less than a thousandth of the area of these prints, and so do
+        the levels above the highest one. Structures must not be finer than the structures in these prints.
 
         Raises:
-            InputError: every earlier layout has only one level, or nearly all of their area has the same one.
+            InputError: every earlier layout has only one level, or nearly the whole area of these layouts has
+                the same level.
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
@@ -117,8 +117,8 @@ class Limits:
         return above.astype(np.min_scalar_type(self.highest)) + self.lowest
 
     def price(self, soft: Tensor) -> Tensor:
-        """Return a penalty that grows if the mean or the standard deviation of the levels is far from that in
-        earlier prints.
+        """Return a penalty. It grows if the mean or the standard deviation of the levels is far from its
+        value in earlier prints.
         """
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
@@ -236,10 +236,10 @@ def as_tensor(level: np.ndarray) -> Tensor:
 class Chosen(NamedTuple):
     """The ways to make and scan prints that were chosen to decide one question, or all questions.
 
-    ``ways`` lists the scans that are made of each print. Successive prints cycle through ``places``, the
-    positions in the write field, and through ``doses``, the relative doses. ``tried`` contains
-    the separation of the two most similar rivals, in standard deviations, for each experiment that was tried,
-    keyed by a description of the experiment.
+    ``ways`` lists the ways in which each print is scanned, one per scan. Successive prints cycle through
+    ``places``, the positions in the write field, and through ``doses``, the relative doses. ``tried``
+    contains the results of the experiments that were tried, keyed by a description of the experiment. Each
+    result is the separation of the two most similar rivals, in standard deviations.
     """
 
     ways: tuple[Way, ...]
@@ -303,8 +303,8 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> list[np.ndarray]:
-    """Optimise ``count`` tiles. Successive tiles are optimised for successive questions, in turn. Return the
-    soft (not rounded) levels of each tile.
+    """Optimise ``count`` tiles. The questions take turns: each tile is optimised for the next question.
+    Return the soft (not rounded) levels of each tile.
 
     Args:
         rivalries: the rivals of each question.
@@ -339,7 +339,7 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return the self-similarity of a layout, which registration also computes.
+    """Return the self-similarity of a layout, as it is defined for registration.
 
     If the value is 1, the layout matches a shifted copy of itself perfectly, and registration cannot
     determine the shift.

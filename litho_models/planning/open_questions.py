@@ -53,8 +53,8 @@ _OF_PLACE = ("vignetting", "field-curvature")
 
 
 def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[ScanFinding]) -> OpenQuestions:
-    """Return all open questions, each with its fitted rivals if it has any. Questions about causes and laws
-    that were found come first, followed by questions about unconfirmed effects, about per-scan terms, and
+    """Return all open questions, each with its fitted rivals if it has any. The first questions are about
+    causes and laws that were found. Then come questions about unconfirmed effects, about per-scan terms and
     about missing facts.
 
     Args:
@@ -128,8 +128,9 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """Return the question about effects that are significant in screening but that held-out scans did not
-        confirm: which of them, if any, explains the residual. Return None if there is no such question.
+        """Return the question which of the unconfirmed effects, if any, explains the residual. An effect is
+        unconfirmed if it is significant in screening and held-out scans did not confirm it. Return None if
+        there is no such question.
         """
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
@@ -176,8 +177,9 @@ class _Asking:
         return rivals
 
     def _spread(self, name: str) -> float:
-        """Return the relative standard deviation, over scans, of the evidence for an effect. The part that
-        noise causes is subtracted in quadrature, and the result is at most 1.
+        """Return the relative standard deviation, over scans, of the evidence for an effect, i.e. of the
+        decrease of the squared error. The part that noise causes is subtracted in quadrature, and the result
+        is at most 1.
 
         Let d be the change that the effect makes to the prediction of a scan, and a the multiple of d that
         fits the scan best. The squared errors of the scan without and with the effect differ by |d|² (2 a -
@@ -204,12 +206,12 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Return the possible sources (printer or microscope) of an effect. If scans of one orientation cannot
-    show which of the two causes the effect, the list contains both. Otherwise, it contains only None, which
-    stands for the source that the catalogue states.
+    """Return the possible sources of an effect. If scans of one orientation cannot show whether the printer
+    or the microscope is the source, the list contains both. Otherwise, it contains only None, which stands
+    for the source that the catalogue states.
 
-    The source of the effect of a tip is also doubtful if the tip is asymmetric: a scan with a tip that is
-    blunter along one axis looks like a scan of a print with wider flanks along that axis.
+    For an asymmetric tip, the source is also unknown. The reason is that a tip that is blunter along one axis
+    and a print that has wider flanks along this axis give similar scans.
     """
     uneven = name == TIP and values["along"] != values["across"]
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
@@ -231,8 +233,8 @@ def _of_single_scans(single_scans: Sequence[ScanFinding]) -> list[Question]:
 
 
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
-    """Make a question about the named effects, and phrase its text. A question of kind ``fact`` is about a
-    single effect; for such a question, ``text`` must state which fact is missing.
+    """Make a question about the named effects, with its text. The argument ``text`` is used only for the kind
+    ``fact``. It states which fact is missing, and the question is about a single effect.
     """
     first, *others = [get_effect(name).title for name in names]
     if kind == "lines":

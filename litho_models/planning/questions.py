@@ -62,9 +62,9 @@ class NoiseSpectrum(Record):
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
-    """Return the measured minus the predicted height of a scan, nm, after the per-scan terms that are free in
-    every scan have been fitted and subtracted. The result is a two-dimensional map without the pixels at the
-    edge of the scan.
+    """Fit the free per-scan terms to the measured minus the predicted height of a scan, and subtract them.
+    Return the remaining residual, nm. The result is a two-dimensional map without the pixels at the edge of
+    the scan.
 
     Pixels that were not measured are NaN.
     """
@@ -111,7 +111,8 @@ class Rival(Record):
             the source.
         effects: parameter values of all effects in the model, keyed by the name of the effect.
         vector: the p fitted parameters. The parameters of the base come first.
-        information: normal matrix of the fit, scaled to the number of all pixels, µm², of shape (p, p).
+        information: normal matrix of the fit, µm², of shape (p, p). The fit uses only some of the pixels, so
+            the matrix is scaled to the number of all measured pixels.
         covariance: cluster-robust covariance of the parameters, of shape (p, p). The clusters are prints or
             scans.
     """
@@ -151,11 +152,11 @@ class Question(Record):
         text: the question in words.
         experiment: experiments that would answer the question, in words.
         rivals: the possible answers.
-        spread: relative standard deviation, over scans, of the evidence for the effect, without the part that
-            noise causes.
+        spread: relative standard deviation, over scans, of the evidence for the effect, i.e. of the decrease
+            of the squared error. The part that noise causes is not included.
         form_nm: upper bound, nm, on the rms error that is due to a wrong form of the model; None if it is
-            unknown. The bound is derived from the part of the residual of the best answer that could still be
-            learned.
+            unknown. It is derived from the part of the residual that could still be learned. The model behind
+            this residual assumes one of the answers.
         sizes: standard deviations of the parameters of a per-scan term over scans, keyed by the name of the
             parameter.
     """
@@ -197,8 +198,9 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Fit each model twice: first from its current parameter values, and then again with the base parameters
-    of the best of these first fits as the starting values. For each model, keep the better of the two fits.
+    """Fit each model twice. The first fit starts from the current parameter values of the model. The second
+    fit starts from the result of the first, with the base parameters of the model that fitted best. For each
+    model, keep the better of the two fits.
     """
 
     def fitted(twin: Twin) -> LeastSquaresFit:

@@ -37,9 +37,9 @@ class PlannedScan(Record):
 class PlannedPair(Record):
     """The predicted comparison of two rivals (competing explanations) on the planned prints.
 
-    ``difference_nm`` is the rms difference between the predictions of the two rivals, after one of them was
-    refitted to the prediction of the other. ``noise_nm`` is the standard deviation per pixel of the noise,
-    projected onto this difference. ``power`` lists the probabilities of a right decision with 1, 2, 3, …
+    ``difference_nm`` is the rms difference that remains between the predictions of the two rivals after one
+    rival is refitted to the other. ``noise_nm`` is the standard deviation per pixel of the noise after
+    projection onto this difference. ``power`` lists the probabilities of a right decision with 1, 2, 3, …
     prints.
     """
 
@@ -56,9 +56,9 @@ class PlannedQuestion(Record):
     same probabilities for prints with random layouts that are scanned in the same way. ``difference_nm`` is
     the rms difference between the predictions of the two most similar rivals (competing explanations) on the
     planned prints. ``random_difference_nm`` is the corresponding difference on the random layouts.
-    ``prints_needed`` is the number of prints for a power of 0.95, or None if no number that was tried is
-    enough. ``form_nm`` is an upper bound on the rms error that is due to a wrong form of the model, or None
-    if it is unknown.
+    ``prints_needed`` is the smallest number of prints with a power of at least 0.95. It is None if even the
+    largest number that was tried is too small. ``form_nm`` is an upper bound on the rms error that is due to
+    a wrong form of the model, or None if it is unknown.
     """
 
     name: str

@@ -95,8 +95,8 @@ def _verdict(plan: NextPrint) -> str:
 
 
 def prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
-    """Draw the height that each rival (competing explanation) predicts for the last scan of a print, and the
-    difference of each prediction from that of the first rival.
+    """Draw the height that each rival (competing explanation) predicts for the last scan of a print. Also
+    draw the differences of these predictions from the prediction of the first rival.
     """
     maps = [rivalry.printing.predict(chain, shown, shown.ways[-1]).numpy() for chain in rivalry.chains]
     figure = new_figure(11, 5.5)

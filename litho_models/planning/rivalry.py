@@ -1,5 +1,5 @@
-"""Compute the separation of rivals (competing explanations) on planned scans. The separation is the
-difference that remains between the predictions of two rivals after one is refitted to the other, relative to
+"""Compute the separation of rivals (competing explanations) on planned scans. One rival is refitted to the
+prediction of the other. The separation is the remaining difference between the two predictions, relative to
 the noise.
 
 The criterion is T-optimality (Atkinson and Fedorov 1975): the distance from the prediction of one model to
@@ -87,9 +87,9 @@ class Printing:
     slow_axis: Literal["y", "x"] = "y"
 
     def reach_um(self, printed: PlannedPrint) -> float:
-        """Return the distance from the centre of the write field to the centre of a print, µm. The distance
-        is the same along both axes. It is 0 for a print at the centre. A print at the edge lies in a corner
-        of the write field.
+        """Return the coordinate of the centre of a print relative to the centre of the write field, µm. It is
+        the same along x and y: a print at the edge lies in a corner of the write field. It is 0 for a print
+        at the centre, or if the width of the write field is unknown.
         """
         if printed.place == "centre" or self.write_field_um is None:
             return 0.0
@@ -192,9 +192,8 @@ class Rivalry:
         return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
-        """Return a copy in which the parameters of the models that are assumed to be true are drawn at
-        random. They are drawn from the normal distribution that describes their uncertainty after earlier
-        prints.
+        """Return a copy with random parameters of the models that are assumed to be true. The parameters are
+        drawn from the normal distribution that describes their uncertainty after earlier prints.
         """
         other = copy.copy(self)
         other.true = []
@@ -238,8 +237,8 @@ class Rivalry:
         return found
 
     def linearised(self, prints: Sequence[PlannedPrint]) -> list[list[Linearised]]:
-        """Linearise the models of all rivals at the parameters from which a refit starts. Return, for each
-        model, one linear problem per scan.
+        """Linearise the models of all rivals at the parameters from which a refit starts. Return one list per
+        model, with one linear problem per scan.
         """
         # Rivals with the same base model share its predictions.
         known: list[Fields] = [{} for one in prints for _ in one.ways]
@@ -247,8 +246,8 @@ class Rivalry:
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
         """Return the contrast of every ordered pair of rivals on the given prints. The argument ``refitted``
-        contains the models that the method of this name returns for these prints. The contrasts are
-        differentiable with respect to the levels of the prints.
+        is the result of the method ``refitted`` for these prints. The contrasts are differentiable with
+        respect to the levels of the prints.
         """
         true = [self._predict(chain, prints) for chain in self.true]
         return [
@@ -265,8 +264,8 @@ class Rivalry:
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
     ) -> Contrast:
-        """Compare the predictions of two models for the given prints. To compute the noise, the difference
-        maps of all scans of a print are added first, because all of these scans show the same roughness.
+        """Compare the predictions of two models for the given prints. All scans of a print show the same
+        roughness. The difference maps of these scans are therefore added before the noise is computed.
         """
         found, scans = [], iter(zip(true, other, strict=True))
         for printed in prints:
@@ -292,9 +291,9 @@ class Rivalry:
     def _linearise(
         self, twin: Twin, prints: Sequence[PlannedPrint], known: Sequence[Fields] | None = None
     ) -> list[Linearised]:
-        """Linearise the predictions of a model for each scan of the prints. The residual in the result is
-        minus the predicted height; the caller must add the target of the fit. ``known`` is a cache of
-        intermediate fields of each scan.
+        """Linearise the predictions of a model for each scan of the prints. The residual in the result is the
+        negative of the predicted height. The caller must add the heights to which the model is fitted.
+        ``known`` is a cache of intermediate fields of each scan.
         """
         scans = [(one, way) for one in prints for way in one.ways]
         known = known or [{} for _ in scans]
@@ -322,7 +321,9 @@ def _chain(twin: Twin) -> EffectChain:
 
 
 def _inner(field: Tensor) -> Tensor:
-    """Cut off the edge of a field, where part of the neighbourhood that a model uses is missing."""
+    """Cut off the edge of a field. There, a model lacks part of the surroundings that it needs for its
+    prediction.
+    """
     border = sample_border_px(min(field.shape))
     return field[border:-border, border:-border]
 
@@ -332,7 +333,7 @@ def _flat(field: Tensor) -> np.ndarray:
 
 
 def _free_basis(prediction_um: Tensor) -> np.ndarray:
-    """Return an array of shape (n, k) whose columns are an orthonormal basis of the k terms that are fitted
-    to each scan, at its n interior pixels.
+    """Return an orthonormal basis of the k terms that are fitted to each scan, at the n interior pixels of
+    the scan. The result has shape (n, k).
     """
     return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)

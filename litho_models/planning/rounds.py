@@ -67,8 +67,8 @@ def close_loop(
         settings: further arguments of ``loop.run.close_loop``.
 
     Raises:
-        InputError: as in ``loop.run.close_loop``. The same error is raised if a further store is of another
-            printer, or if the orientation of a scan differs from the one that its dataset card states.
+        InputError: as in ``loop.run.close_loop``; also if a further store is of another printer, or if a scan
+            has another orientation than its dataset card states.
     """
     first = open_store(store)
     new, dropped, used = list[PrintedScan](), list[str](), list[str]()
@@ -90,9 +90,9 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]:
-    """Return the scans of a further store that have enough measured pixels, and texts that name the other
-    scans. The function first checks that the store is of the same printer as the first store, and that these
-    scans have the orientation that the dataset card states.
+    """Return two lists for a further store: the scans with enough measured pixels, and for each other scan a
+    text with its name and the reason. Before that, check two things: both stores must be of the same printer,
+    and the scans must have the orientation that the dataset card states.
 
     Raises:
         InputError: the store is of another printer, its prints were planned for another dataset, none of its
@@ -133,11 +133,11 @@ def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]
 
 
 def decide(closed: Closed, open_: OpenQuestions, new: Sequence[PrintedScan]) -> list[Decision]:
-    """Return the decision on every open question, except for questions about missing facts, which scans
-    cannot answer.
+    """Return the decisions on all open questions that scans can answer. Questions about missing facts are
+    left out.
 
     Args:
-        closed: the loop whose questions these are.
+        closed: the loop that left the questions.
         open_: the open questions of this loop.
         new: new scans, which this loop did not use.
     """
@@ -206,8 +206,8 @@ class Judge:
 
     def of_lines(self, question: Question) -> Decision:
         """Decide whether the printer or the microscope causes line offsets. For this purpose, compare two
-        variances in the rotated scans: that of the offsets of the layout's rows, and that of the offsets of
-        the scan lines.
+        variances in the rotated scans: the variance of the offsets of the layout's rows, and the variance of
+        the offsets of the scan lines.
         """
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
@@ -241,7 +241,7 @@ def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Dec
         cause = next((one for one in closed.traced if one.name == name), None)
         if not left or decision.verdict == NONE or (cause is None and len(left) > 1):
             continue
-        # The cause keeps its name if it remains.
+        # If the cause itself remains possible, it is kept.
         best = min(left, key=lambda one: one.effect != name)
         if best.effect != name and best.effect in closed.final.twin.names:
             continue
@@ -270,8 +270,8 @@ def compared(
     Args:
         question: the question.
         new: the new scans.
-        left_nm: residual of each answer, and of the model without the effect, on each new scan. The lists are
-            keyed by the name of the answer and contain one map of shape (ny, nx), nm, per scan.
+        left_nm: for each answer, its residual on each new scan, as a list of maps of shape (ny, nx), nm. The
+            lists are keyed by the name of the answer. One more list is for the model without the effect.
     """
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
     # As in the loop, a difference that is smaller than the fraction ``SMALLEST_SHARE`` of the squared error
@@ -307,8 +307,8 @@ def _compare(
     """Compare the squared errors of two rivals (competing explanations) on the new scans.
 
     The squared errors are summed over blocks of pixels. The difference between the sums of the two rivals is
-    compared with its spread over the blocks of a print and with its spread between prints. If scans of a
-    print differ in size, their blocks do not correspond, so these scans are treated separately.
+    compared with its spread over the blocks of a print and with its spread between prints. If the scans of a
+    print differ in size, their blocks do not correspond. The scans of each size are then treated separately.
     """
     by_print: dict[tuple[str, tuple[int, ...]], np.ndarray] = {}
     pixels, difference = 0, 0.0
@@ -353,15 +353,15 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """Make the record of the decision on a question. By default, the question counts as decided if only one
-    answer remains.
+    """Make the record of the decision on a question.
 
     Args:
         question: the question.
         scans: the scans on which it was decided.
         left: the answers that remain possible.
         evidence: the evidence, in words.
-        verdict: the verdict; None if it follows from the number of remaining answers.
+        verdict: the verdict. If it is None, the question is decided if one answer remains, and otherwise
+            still open.
     """
     return Decision(
         question=question.name,

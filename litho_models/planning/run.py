@@ -101,7 +101,7 @@ def next_print(
 
     Args:
         loop: folder with the result of a closed loop.
-        out: folder of the plan, which appears only when the plan is complete.
+        out: folder of the plan. It appears only when the plan is complete.
         prints: largest number of prints.
         field_um: side length of each print, µm.
         seed: seed of the random layouts.
