@@ -65,9 +65,11 @@ def new_board(
     Args:
         out: folder of the board.
         board: ``singles`` (one cause per trial) or ``mixtures`` (two to four causes per trial). On each
-            board, some trials have no cause. ``seed``: determines all random draws.
+            board, some trials have no cause.
+        seed: determines all random draws.
         trials: number of trials to make, starting with the first drawn trial; None makes all trials.
-        n_scans: number of scans in each store; ``size_px``: side of a layout, in pixels.
+        n_scans: number of scans in each store.
+        size_px: side length of a layout, in pixels.
 
     Raises:
         InputError: no trials can be drawn with these settings, or ``out`` holds another board.
@@ -106,19 +108,19 @@ def judge_board(
     ``scoreboard.csv``.
 
     If the loop raises an error, only the current trial counts as failed, and the next trial is run. If the
-    call is interrupted, repeating it resumes the work.
+    call is interrupted, repeat it to resume the work.
 
     Args:
         board: folder written by ``new_board``.
         out: folder for the results; the files that the loop writes are kept in one folder per trial.
-        loop: function that receives the path of a store and of an empty folder and returns an answer; by
-            default the closed loop of this package.
-        name: name of the loop, which is written to the scoreboard. If ``out`` holds results of a loop with
-            another name, an error is raised.
+        loop: function that receives the path of a store and the path of an empty folder. It returns an
+            answer. The default is the closed loop of this package.
+        name: name of the loop. It is written to the scoreboard.
         report: function that receives the progress messages of the default loop.
 
     Raises:
-        InputError: ``board`` holds no board, or ``out`` holds the trials of another board or loop.
+        InputError: ``board`` holds no board, or ``out`` holds the trials of another board or of a loop with
+            another name.
     """
     source = Path(board)
     draws = Draws.read(source)
@@ -142,8 +144,9 @@ def judge_board(
 
 
 def command_loop(command: str) -> Loop:
-    """Turn a shell command into a loop function. The last two arguments of the command are the path of a
-    store and the path FOLDER of an empty folder. The command writes its answer to FOLDER/answer.json.
+    """Make a loop function that runs a command. Two arguments are appended to the command: the path of a
+    store, and the path of an empty folder. The command must write its answer to the file answer.json in this
+    folder.
 
     Raises:
         InputError: the command cannot be run. The returned function raises the same error if the exit code of
@@ -195,9 +198,9 @@ def cpu_s() -> float:
 
 
 def trial_line(trial: Trial) -> str:
-    """Describe a judged trial in one line. The line states the outcome of each planted cause, the causes that
-    the loop named wrongly, and the error of the corrected model as a multiple of the error of the true
-    models. For a failed trial, it also states the reason for the failure.
+    """Describe a judged trial in one line. The line states the outcome of each planted cause and the causes
+    that the loop named wrongly. It also states the error of the corrected model divided by the error of the
+    true models. For a failed trial, it also states the reason for the failure.
     """
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false name: {name}" for name in trial.false_names]

@@ -1,6 +1,5 @@
 """Choose at random which causes of error the virtual fab adds to the prints and scans of each trial of a
-board. The causes are knobs of the virtual fab (all but a few, which are listed below) and the forms in
-``other_forms``.
+board. The causes are the forms in ``other_forms`` and most knobs of the virtual fab.
 
 One seed determines all draws. They are made before the loop runs on any trial.
 
@@ -68,9 +67,9 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
     own printer parameters.
 
     Each knob (setting of the virtual fab) and each form (law that the loop's catalogue does not contain) is
-    used once before any of them is used again. On the board ``singles``, the kind of a trial is ``alias`` if
-    its cause is a knob whose effect the base model can imitate or the per-scan terms can absorb. With any
-    other knob, the kind is ``in-form``. The sizes of the causes are drawn log-uniformly.
+    used once before any of them is used again. On the board ``singles``, a trial with a knob is of kind
+    ``alias`` or ``in-form``. It is of kind ``alias`` if the base model can imitate the effect of the knob, or
+    if the per-scan terms can absorb it. The sizes of the causes are drawn log-uniformly.
 
     Raises:
         InputError: the seed is negative.
@@ -81,9 +80,7 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
 
 
 def names_of(cause: str) -> tuple[str, ...]:
-    """Return the names of effects in the loop's catalogue that count as the right answer for a knob or a
-    form.
-    """
+    """Return the right answers for a knob or a form, as names of effects in the loop's catalogue."""
     if cause in FORMS:
         return FORMS[cause].names
     effect = KNOBS[cause].effect
@@ -128,8 +125,8 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 def _draw_mixtures(rng: Rng) -> list[Draw]:
     """Draw the trials of the board ``mixtures``.
 
-    About half of the causes have a form that is in the loop's catalogue. No two causes of a trial share a
-    name that counts as the right answer.
+    About half of the causes have a form that is in the loop's catalogue. No two causes of a trial have a
+    right answer in common.
     """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
@@ -165,9 +162,9 @@ def _draw_mixtures(rng: Rng) -> list[Draw]:
 
 
 def _in_groups(cause: CauseDraw, at: int, rng: Rng) -> CauseDraw:
-    """For the first trials of the board ``mixtures``, make the strength of a cause differ by batch or by
-    field. ``at`` is the index of the trial before the trials are shuffled. In all other trials, the cause is
-    left unchanged.
+    """In the first trials of the board ``mixtures``, make the strength of a cause differ by batch or by
+    field. In all other trials, return the cause unchanged. ``at`` is the index of the trial before the trials
+    are shuffled.
     """
     if at < LINEAR:
         return _by_batch(cause, rng)
@@ -187,7 +184,7 @@ def _draw_printer(rng: Rng) -> dict[str, float]:
 
 
 def _by_batch(cause: CauseDraw, rng: Rng) -> CauseDraw:
-    """Make a cause weaker in the prints after a random point near the middle of the printing order."""
+    """Draw a point near the middle of the printing order, and make a cause weaker in the prints after it."""
     place, weak = f"{rng.uniform(-0.2, 0.2):.3f}", round(rng.uniform(0.0, 0.6), 3)
     return cause.model_copy(update={"by": "batch", "place": place, "weak": weak})
 
@@ -206,9 +203,8 @@ def _deal(names: Sequence[str], rng: Rng) -> Iterator[str]:
 
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
-    """Draw causes from ``deck`` and add them to those in ``started`` until there are ``size`` causes. Skip a
-    cause if a name that counts as its right answer is in ``refused``, or also counts for a cause chosen
-    before.
+    """Start with the causes ``started``, and add causes from ``deck`` until there are ``size`` causes. Skip a
+    cause if one of its right answers is in ``refused`` or is also a right answer for an earlier cause.
     """
     names = list(started)
     while len(names) < size:

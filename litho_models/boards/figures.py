@@ -52,8 +52,8 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """Return a text with the number of True values, the number of all values, and the exact (Clopper-Pearson)
-    95 % confidence interval of the share of True values.
+    """Count the True values. Return a text with this count, the number of all values, and the exact
+    (Clopper-Pearson) 95 % confidence interval of the share of True values.
     """
     known = [*hits]
     if not known:
@@ -76,8 +76,8 @@ def counted(trials: Iterable[Trial]) -> list[Outcome]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """Compute the headline results. In a failed trial, no cause counts as found, and the error of the
-    corrected model counts as above its tolerance.
+    """Compute the headline results. In a failed trial, no cause counts as found, and the corrected model
+    counts as one with too large an error.
     """
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
@@ -115,8 +115,8 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Return True if the error of the model that was corrected with the loop's findings is within the
-    tolerance for this kind of trial. Return False if the error is unknown.
+    """Return whether the error of the corrected model is within the tolerance for this kind of trial. If the
+    error is unknown, return False.
     """
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)

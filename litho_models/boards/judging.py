@@ -22,8 +22,8 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# For these forms, a right name counts only if the loop also states an exponent whose confidence interval
-# contains this value.
+# A right name for one of these forms counts only if the loop also states the exponent of a power law. Its
+# confidence interval must contain this value.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
 # The form ``periodic-lines`` consists of line offsets, so a loop that reports line offsets counts as having
@@ -32,8 +32,8 @@ _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Return the findings without those about effects of single scans in the loop's catalogue, such as datum,
-    bow or line offsets. The default noise of the virtual fab adds such effects to every scan.
+    """Leave out findings about per-scan terms of the loop's catalogue, such as datum, bow or line offsets.
+    The default noise of the virtual fab adds such terms to every scan. Return the other findings.
     """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
@@ -44,10 +44,12 @@ def judged(
     """Judge one trial.
 
     Args:
-        draw: the trial as drawn; ``planted``: the planted causes with their strengths, as returned by
-            `plant`.
-        answer: answer of the loop; ``used_s``: CPU time that the loop used, s.
-        jobs: the printed fields; ``store``: dataset store that the loop received.
+        draw: the trial as drawn.
+        planted: the planted causes with their strengths, as returned by `plant`.
+        answer: answer of the loop.
+        jobs: the printed fields.
+        store: dataset store that the loop received.
+        used_s: CPU time that the loop used, s.
     """
     locked = set(store.locked_ids)
     scans = [scan for scan in store.scans() if scan.id not in locked]
@@ -110,8 +112,9 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the wrong findings. A finding that names causes is wrong if it is the right answer for none of
-    the planted causes. These include the form that changes the printer (``base`` of the draw).
+    """Return the wrong findings. Only findings that name a cause are considered. Such a finding is wrong if
+    it is the right answer for none of the planted causes. The form that changes the printer (``base`` of the
+    draw) counts as one of the planted causes.
     """
     return [
         " | ".join(named.names)
@@ -135,8 +138,8 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Return True if the loop found that groups of scans share a displacement along x, and if none of these
-    groups contains both strongly and weakly displaced scans.
+    """Return whether the loop found that the scans of each group have a displacement along x in common. The
+    groups must be right: no group may contain both strongly and weakly displaced scans.
     """
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
@@ -196,8 +199,8 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Return two numbers: the median relative error of the base model's physical values when they are fitted
-    without the loop's findings, and the same when they are fitted with the findings.
+    """Return the median relative error of the base model's physical values for two fits: without the loop's
+    findings, and with them.
 
     Return None if the printer or the base model is not a Physics model.
     """

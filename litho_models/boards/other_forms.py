@@ -430,8 +430,8 @@ def _elliptical_blur(rng: Rng) -> Law:
 
 
 def _spread(dose: Array, strength: float, transfer: Array) -> Array:
-    """Mix the dose, with weight 1, and the dose filtered by a transfer function, with weight ``strength``.
-    The transfer function is 1 at zero frequency. The weights are scaled to a sum of 1.
+    """Return a weighted mean of two doses. The dose itself has weight 1. The dose after filtering with a
+    transfer function, which is 1 at zero frequency, has weight ``strength``.
     """
     return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 

@@ -51,7 +51,7 @@ def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
 
 
 def share_of(cause: CauseDraw, job: Job) -> float:
-    """Return the fraction of its full strength that a cause has in one scan."""
+    """Return the strength of a cause in one scan, as a fraction of its full strength."""
     if cause.by == "all":
         return 1.0
     strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
@@ -91,15 +91,14 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """For each drawn cause, find the strength at which it has its drawn size. The size is measured with only
-    this cause planted in the given fields.
+    """Find the strength of each drawn cause from its drawn size. To measure the size, plant only this cause
+    in the given fields.
 
     If the draw has a form that changes the printer (``base``), this form comes first in the result.
 
     If a cause cannot reach its drawn size, it is planted at its largest allowed strength, and the size at
     this strength is recorded. It is not replaced by another cause. For a trial of kind ``alias``, the drawn
-    size is compared with the change of the scans before the refit, because the refit absorbs most of this
-    change.
+    size is the rms change of the scans before the refit, because the refit absorbs most of this change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [_sized(one, jobs, draw) for one in drawn]

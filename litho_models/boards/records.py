@@ -29,12 +29,12 @@ class CauseDraw(Record):
     """A drawn cause. It contains the name of a knob (setting of the virtual fab) or of a form from
     ``other_forms``, and the size that the cause should have.
 
-    The size is defined as in `Planted.rms_nm`.
+    The size is defined as in `Planted.rms_nm`. Trials of kind ``alias`` are an exception; see `plant`.
 
     Attributes:
-        by: how the strength varies. ``all``: all scans have the full strength. ``batch``: the scans after
-            ``place`` in the printing order have only ``weak`` times the strength. ``field``: the scans whose
-            id does not end in a digit of ``place`` have only ``weak`` times the strength.
+        by: how the strength varies. With ``all``, it is the same in all scans. Otherwise, it is multiplied by
+            ``weak`` in some scans. With ``batch``, these are the scans after ``place`` in the printing order.
+            With ``field``, these are the scans with an id that does not end in a digit of ``place``.
     """
 
     name: str
@@ -49,8 +49,8 @@ class Draw(Record):
 
     Attributes:
         seed: determines the layouts, the noise, and the random values of knobs and forms.
-        printer: the parameters in which the printer of this trial differs from the default printer; ``base``:
-            form that changes the printer so that the Physics model cannot imitate it.
+        printer: the parameters in which the printer of this trial differs from the default printer.
+        base: form that changes the printer so that the Physics model cannot imitate it, or None.
     """
 
     number: int
@@ -82,8 +82,8 @@ class Planted(Record):
 
     Attributes:
         names: names in the loop's catalogue of effects that count as a right answer.
-        strength: strength, in ``unit``; ``at_limit``: True if the drawn size could not be reached, so that
-            the strength is the largest allowed.
+        strength: strength, in ``unit``.
+        at_limit: whether the strength is the largest allowed, because the drawn size could not be reached.
         rms_nm: size of the cause, nm. It is the rms of the residual in noise-free scans that contain only
             this cause, after the base model, the per-scan terms and the registration are refitted.
     """
@@ -129,7 +129,7 @@ class TrialErrors(Record):
 
     @property
     def ratio(self) -> float | None:
-        """Return the ratio of the corrected model's error to that of the true models."""
+        """Return the error of the corrected model divided by the error of the true models."""
         return self.after_nm / self.floor_nm if self.floor_nm else None
 
 
@@ -139,8 +139,8 @@ class Found(Record):
     Attributes:
         names: name of the effect in the loop's catalogue, followed by the names of effects that cannot be
             distinguished from it.
-        by: how the strength varies. ``all``: one strength for all scans; ``scan``: one strength per scan;
-            otherwise the name of the grouping of scans that has one strength per group.
+        by: how the strength varies. ``all``: one strength for all scans; ``scan``: one strength per scan. Any
+            other text is the name of a grouping, with one strength per group of scans.
         exponents: confidence intervals of the exponent, if the finding is a power law.
     """
 
@@ -156,13 +156,13 @@ class Answer(Result):
     Attributes:
         found: causes, laws and descriptions.
         left: whether the residual has structure that the loop cannot explain.
-        absorbed: names of effects whose influence the loop's base model can absorb, so that the loop cannot
-            detect them.
-        displaced_by: names of the groupings, as in `Found.by`, whose groups of scans share a displacement
-            along x.
-        before_nm, after_nm: mean absolute error without and with the findings, over the scans that are not
-            locked. Each scan is predicted by a model that was fitted to other scans, and one offset is fitted
-            to the scan before the error is computed. None if the loop does not state the error.
+        absorbed: names of effects that the loop cannot detect, because its base model can absorb them.
+        displaced_by: names of groupings, as in `Found.by`. The scans of each group have a displacement along
+            x in common.
+        before_nm, after_nm: mean absolute error of the model without and with the findings, over the scans
+            that are not locked. Each scan is predicted by a model that was fitted to other scans, and one
+            offset is fitted to the scan before the error is computed. None if the loop does not state the
+            error.
         base_values, corrected_values: fitted values of the Physics model, without and with the findings.
     """
 
@@ -186,8 +186,8 @@ class Trial(Result, extra="ignore"):
     failed.
 
     Attributes:
-        false_names: the wrong findings, each given by its names. None of these names is the right answer for
-            a planted cause.
+        false_names: the wrong findings, i.e. those that are the right answer for none of the planted causes.
+            Each is given by the names of its effects.
         bias: median relative error of the base model's values, without and with the findings; None if the
             printer or the base model is not a Physics model.
         dataset_cpu_s: CPU time that the loop used, s. In the published boards, it includes the time to build
