@@ -29,8 +29,8 @@ _UNKNOWN = re.compile(
 )
 # Names of numbers that convert counts into heights, such as m and b in "m · counts + b".
 _OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
-# Names of scales and offsets that stand outside an array's own attributes, i.e. in single values beside the
-# array or in attributes of its groups. Many attributes there have nothing to do with the array, so only
+# Names of scales and offsets that are stored as scalars beside the array or as attributes of its groups, and
+# not as attributes of the array itself. Many attributes there have nothing to do with the array, so only
 # unambiguous names are listed.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
@@ -54,8 +54,8 @@ class Coordinate:
     """The positions of the pixels along one dimension of an array.
 
     ``values`` contains the positions, in ``unit``. If the file states only a length, ``values`` is None and
-    ``length`` contains this length. ``axis`` is the axis that the attributes of the positions name, such as
-    "x"; it is empty if they name none.
+    ``length`` contains this length. ``axis`` is the name of the axis, such as "x", if the attributes of the
+    positions state it. Otherwise it is empty.
     """
 
     values: Array | None
@@ -85,8 +85,8 @@ class Held:
     shape, a function that reads its values, and what the file says about the array.
 
     ``dims`` contains the names of the array's two dimensions. ``coordinates`` maps names of dimensions to
-    their coordinates, and may include dimensions of other arrays in the file. ``around`` contains the single
-    values that are stored beside the array, and the attributes of the groups that contain it.
+    their coordinates, and may include dimensions of other arrays in the file. ``around`` contains the scalars
+    that are stored beside the array, and the attributes of the groups that enclose the array.
     """
 
     dtype: np.dtype
@@ -99,8 +99,8 @@ class Held:
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
-        """Wrap an array that has already been read. ``described`` contains the values of those fields of this
-        class that follow ``read``, in order.
+        """Wrap an array that has already been read. ``described`` contains values for the fields that come
+        after ``read``, in the order of the fields.
         """
         native = np.array(values, dtype=values.dtype.newbyteorder("="))
         return cls(native.dtype, native.shape, partial(np.array, native), *described)
@@ -167,8 +167,8 @@ def array_channel(name: str, held: Held) -> Channel:
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
     """Return the names of the dimensions along y and x, and True if the array's first index runs along x.
 
-    If neither dimension of the array has coordinates, coordinates named x and y in the file are used,
-    provided that their lengths match the array.
+    If neither dimension has coordinates, the function returns the names of two coordinates with names like x
+    and y. It does so only if their lengths match the shape of the array.
     """
     known = held.coordinates
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)
@@ -200,7 +200,8 @@ def _plain(value: Any) -> Any:
 def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
     """Read the values, set missing pixels to NaN, and apply scale and offset.
 
-    Marks of missing pixels are compared with the stored numbers, before scale and offset are applied.
+    The numbers that mark missing pixels are compared with the stored values, before scale and offset are
+    applied.
     """
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
@@ -215,8 +216,8 @@ def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
 def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list[Channel]:
     """Make one channel per two-dimensional array in a file without groups.
 
-    One-dimensional arrays are taken as coordinates of the two-dimensional arrays (maps). Single values, such
-    as a unit, are taken to apply to all maps. ``around`` contains the attributes of the whole file.
+    One-dimensional arrays are taken as coordinates of the two-dimensional arrays (maps). Scalars, such as a
+    unit, apply to all maps. ``around`` contains the attributes of the whole file.
     """
     lines = {name: _coordinate(one.read(), one.attributes) for name, one in arrays.items() if _is_line(one)}
     single = {name: one.read().ravel()[0] for name, one in arrays.items() if _size(one) == 1}
@@ -328,7 +329,7 @@ def _coordinate(values: Array, attributes: Facts) -> Coordinate:
 def read_netcdf(path: Path) -> list[Channel]:
     """Read one channel per two-dimensional variable of a NetCDF 3 file.
 
-    Scale, unit and missing pixels are taken from attributes named as in the CF conventions.
+    Scale, unit and missing pixels are taken from the attributes that the CF conventions define.
     """
     from scipy.io import netcdf_file
 

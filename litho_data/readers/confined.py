@@ -1,8 +1,8 @@
 """Run parsers of other projects in a child process, within limits of computing time and memory.
 
-A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. Each process
-that reads files starts one child process at its first file and uses it for all files. A new child is started
-only after a parser has exceeded a limit or crashed.
+A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. A process
+that reads files starts a single child process, at its first file, and uses this child for all files. A new
+child is started only after a parser has exceeded a limit or crashed.
 """
 
 import atexit
@@ -42,10 +42,10 @@ def parse(function: Callable[[], T], path: Path, kind: str, parsers: tuple[str, 
     Args:
         function: the function, which takes no argument.
         path: the file that it parses. The limits depend on the size of the file.
-        kind: name of the format that messages show.
-        parsers: names of other projects' modules that the function needs. If any are named, the function runs
-            in the child process and must be picklable. On systems other than POSIX, the function always runs
-            in the calling process.
+        kind: name of the format, for messages.
+        parsers: names of the modules of other projects that the function needs. If there are any, the
+            function runs in the child process and must be picklable. On systems other than POSIX, the
+            function always runs in the calling process.
     """
     guarded = partial(_guarded, function, kind)
     return _CHILD.call(guarded, path, parsers) if parsers and os.name == "posix" else guarded()
@@ -108,7 +108,7 @@ class _Child:
         self._owner = os.getpid()
 
     def _end(self, error: Exception, computing_s: float) -> str:
-        """End the child, and return the reason why it gave no answer, in words for a message."""
+        """End the child, and return a text for a message that says why the child gave no result."""
         assert self._process is not None
         if isinstance(error, TimeoutError):
             self._process.kill()
@@ -127,8 +127,8 @@ class _Child:
 
 
 def serve(descriptor: int) -> None:
-    """Run in the child process: receive functions, run them, and send back their results until the parent
-    process has ended.
+    """Receive functions from the parent process, run them, and send back their results, until the parent
+    process has ended. This function runs in the child process.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe = Connection(descriptor)

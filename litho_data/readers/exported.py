@@ -1,5 +1,5 @@
-"""Read the levels from files that the design package exported for a printer. Beside each exported file lies
-its sidecar, a JSON file that says how to read the exported file.
+"""Read the levels from files that the design package exported for a printer. Each exported file has a sidecar
+in the same folder. The sidecar is a JSON file that says how to read the exported file.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def export_of(file: Path) -> dict[str, Any]:
 
 
 def sidecar_of(file: Path) -> Path | None:
-    """Return the path of the sidecar from which ``export_of`` reads, or None if the file has no sidecar."""
+    """Return the path of the sidecar of an exported file, or None if the file has no sidecar."""
     return path if _said(path := _beside(file)) else None
 
 
@@ -75,9 +75,9 @@ def exported_levels(path: Path, says: Facts) -> Array:
 
 
 def exported_rows(path: Path, says: Facts) -> Any:
-    """Return the levels of a whole exported file, including its alignment marks. The result is an array, or
-    an object that can be sliced by rows. For TIFF and GDS, it is such an object, and a slice reads only the
-    requested rows.
+    """Return the levels of a whole exported file, including its alignment marks. For TIFF and GDS, the result
+    is an object that can be sliced by rows, and a slice reads only the requested rows. For all other formats,
+    the result is an array.
 
     Raises:
         InputError: the sidecar is incomplete, or the file does not match it.
@@ -142,8 +142,8 @@ def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int])
     """Read the levels from the closed polylines of an exported DXF. The result is a uint8 array of shape (ny,
     nx), with row 0 at the top.
 
-    The name of a polyline's layer is the grey value of its level. The first point in the record of a
-    polyline is not a corner and is skipped.
+    Each level has its own layer, and the name of the layer is the grey value of the level. The first point in
+    the record of a polyline is not a corner and is skipped.
     """
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)

@@ -58,9 +58,9 @@ class GdsRows:
     def __getitem__(self, rows: slice) -> Array:
         top, bottom, _ = rows.indices(self.shape[0])
         low, high = self.shape[0] - bottom, self.shape[0] - top
-        # A rectangle is added through its four corners: each adds or subtracts the level everywhere above and
-        # to the right of the corner. The cumulative sums over rows and columns do this for all corners at
-        # once.
+        # A rectangle is the sum of four quadrants, one for each corner. A quadrant adds or subtracts the
+        # level everywhere above and to the right of its corner. The cumulative sums over rows and columns add
+        # all quadrants at once.
         steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
         for x0, y0, cell in self._bands:
             if y0 < high and y0 + _BLOCK_PX > low:
@@ -77,7 +77,9 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Find, for every cell, where its rectangles lie in the file, and which other cells it places."""
+        """Find where the rectangles of every cell are stored in the file, and which other cells the cell
+        contains.
+        """
         at, cell, name = 0, "", ""
         while True:
             # The records that are evaluated here fit in 64 bytes. The records of rectangles are skipped.

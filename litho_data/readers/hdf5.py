@@ -1,4 +1,4 @@
-"""Read HDF5 files. Files of known programs (JPK's series, Nanosurf's NHF, TopoStats' results) are read by the
+"""Read HDF5 files. Files of JPK (series), Nanosurf (NHF), TopoStats and Zygo (DATX) are read by the
 conventions of these programs. Files of all other programs are read as self-describing arrays.
 """
 
@@ -31,9 +31,10 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 def read_channels(path: Path) -> list[Channel]:
     """Return the channels of an HDF5 file.
 
-    From JPK and Nanosurf files, one channel is read per signal and direction (trace and retrace). From
-    TopoStats files, the flattened image and the raw image are read, both in nm. Thumbnails, traces of grains
-    and other tables in these files are skipped. Other files are read by ``read_hdf5``.
+    JPK's and Nanosurf's files give one channel per signal and scan direction (trace and retrace), for each
+    frame or image. TopoStats' files give the flattened image and the raw image, both in nm. Thumbnails,
+    traces of grains and other tables in these files are skipped. Zygo's files are read with the library
+    SurfaceTopography, and all other files by ``read_hdf5``.
 
     Raises:
         InputError: the file is damaged.
@@ -55,7 +56,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
-    """Return the channels of one measurement in a JPK file, one per signal and frame.
+    """Return the channels of one measurement in a JPK file, one per signal, scan direction and frame.
 
     The values of a signal have shape (pixels, frames). The dataset ``Position_Indices`` contains the column
     and row of each pixel.
@@ -98,9 +99,7 @@ def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: f
 
 
 def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
-    """Return one channel for every signal of every image and scan direction. Groups without images are
-    skipped.
-    """
+    """Return one channel per image, scan direction and signal. Groups without images are skipped."""
     import h5py
 
     channels = []

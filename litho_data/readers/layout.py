@@ -42,8 +42,8 @@ def read_layout(
 
     Raises:
         InputError: the file does not exist, is damaged, has a format that is not supported, or is not grey;
-            its values are neither levels nor multiples of the grey step; or its sidecar belongs to another
-            file.
+            its values are neither levels nor multiples of the grey step; ``average_px`` is given but the
+            image has more than two grey values; or the sidecar belongs to another file.
     """
     file = require_file(path)
     if says := export_of(file):
@@ -64,7 +64,7 @@ def read_layout(
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:
-    """Count the light pixels in each square of ``side`` pixels, in an image with two grey values."""
+    """Count the light pixels in each square with sides of ``side`` pixels, in an image with two grey values."""
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:

@@ -1,5 +1,5 @@
-"""Handle missing pixels. A file may mark missing pixels with a number or a word, and the caller must state
-these marks.
+"""Handle missing pixels. A file may contain a number or a word (a mark) in place of the height of a missing
+pixel. The caller must state the marks.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from litho_data.readers.text_blocks import WORDS
 
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
-# An extreme value that is not one of the usual marks looks like a mark if its distance from the other values
-# exceeds a multiple of their span. The first multiple applies if several pixels have the value, the second if
-# only one pixel has it.
+# An extreme value looks like a mark if its distance from the other values exceeds a multiple of the span of
+# the other values. The first multiple applies if several pixels have the extreme value, and the second if
+# only one pixel has it. For the usual marks, the multiple is 1.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
 # Values count as equal within these relative tolerances, because they may be stored as float32. Values above
@@ -58,7 +58,7 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
 
 
 def _marks(values: Array) -> list[tuple[float, int]]:
-    """Return the extreme values that look like marks, each with the number of pixels that have this value.
+    """Return the extreme values that look like marks of missing pixels, each with the number of its pixels.
     The most extreme value comes first.
     """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
@@ -77,8 +77,8 @@ def _marks(values: Array) -> list[tuple[float, int]]:
 
 
 def extreme_note(values: Array) -> str:
-    """Return a warning if the lowest or highest value of a map occurs in suspiciously many pixels, otherwise
-    an empty text.
+    """Return a warning if the lowest or the highest value of a map occurs in suspiciously many pixels.
+    Otherwise return an empty text.
     """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     if not len(numbers):

@@ -33,8 +33,8 @@ def read_channels(path: Path) -> list[Channel]:
 def read_archive(path: Path) -> list[Channel]:
     """Return one channel per two-dimensional array of numbers in an ``.npz`` file.
 
-    The unit and the axes are taken from single values and one-dimensional arrays in the same file, as for a
-    MATLAB file. Other arrays are skipped.
+    The unit and the axes are taken from scalars and one-dimensional arrays in the same file, as for a MATLAB
+    file. Other arrays are skipped.
 
     Raises:
         InputError: the file is damaged.

@@ -22,8 +22,8 @@ _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """Yield the path of an unpacked file. If the given file is packed, this is the path of a temporary file
-    with the unpacked content. Otherwise, it is the given path.
+    """If the file is packed, yield the path of a temporary file with the unpacked content. Otherwise, yield
+    the given path.
 
     Raises:
         InputError: the file is damaged, or its content is larger than 1 GiB.

@@ -1,11 +1,11 @@
-"""Read printed fields in the pair format of the paper's authors. Each field is stored as a pair of 8-bit
-images, one of the layout and one of the heights. A field may also be cut into four quadrants, with one pair
-of images for each.
+"""Read printed fields in the format that the authors of the PBL paper use. Each field is stored as a pair of
+8-bit images, one of the layout and one of the heights. A field may also be cut into four quadrants, with one
+pair of images for each.
 
 In an image of heights, the height of a pixel is its grey value, divided by 255 and multiplied by the full
-scale. The format has no negative heights and only 256 grey values, so it loses accuracy. The authors' files
-have no mask of valid pixels. This project adds one as a third image, in which pixels that were not measured
-are black.
+scale. The format cannot store negative heights, and it rounds heights to 256 values. The authors' files have
+no mask of valid pixels. This project adds one as a third image, in which pixels that were not measured are
+black.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ def stitch_field(
     """Join the quadrants of one field, and return the arrays of the field, keyed by name.
 
     Args:
-        files: the images of the layout, followed by the images of the heights and, if there are any, by the
-            masks of valid pixels. All groups are in the order of ``quadrants``.
+        files: the images of the layout, then the images of the heights, then the masks of valid pixels, if
+            there are any. Each of these groups has one image per quadrant, in the order of ``quadrants``.
         quadrants: the numbers of the quadrants, 1 to 4, or only 0 for an undivided field.
         full_scale_um: for each image of heights, the height that grey value 255 stands for.
         levels: number of levels that the layout may have.

@@ -60,15 +60,15 @@ def read_scan(
         missing: numbers (as stored in the file) and words that mark pixels without a measurement, in addition
             to the marks that the file itself states. An empty list states that there are no such additional
             marks.
-        defaults: those of the arguments ``unit`` and ``size_um`` that are mere default values: a value that
-            the file states takes precedence over them. Arguments that are not named here must agree with what
-            the file states.
+        defaults: which of the arguments ``unit`` and ``size_um`` are only default values. If the file states
+            the unit or the size, the default is ignored. An argument that is not listed here must agree with
+            the file.
 
     Raises:
         InputError: the file is unreadable; it has no height channel, or it has several and ``channel`` is not
-            given; its unit is missing; its unit or size contradicts the arguments; a value looks like a mark
-            of missing pixels but is not in ``missing``; the heights are impossibly large; or no height is
-            finite.
+            given; its unit is missing; its unit or size contradicts the arguments; the file contains a word
+            that is not in ``missing``; ``missing`` is None and a number looks like a mark of missing pixels;
+            the heights are impossibly large; or no height is finite.
     """
     given = require_file(path)
     with about(str(given)), unpacked(given) as file:
@@ -122,13 +122,14 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
     given = require_file(path)
     with about(str(given)), unpacked(given) as file:
         channels = _read_channels(_settle_format(file, format), file)
-    # The temporary unpacked file is deleted before a channel is loaded, so loading must unpack it again.
+    # The temporary unpacked file is deleted before a channel is loaded, so ``load`` must unpack the file
+    # again.
     return [replace(one, load=partial(_load, given, format, one.name)) for one in channels]
 
 
 def own_reader_sha256(path: str | Path, format: str = "auto") -> str:
     """Return the hash of the source code of the registered reader that ``read_scan`` uses for a file. The
-    result is empty if it uses a reader of this package.
+    result is empty if ``read_scan`` uses a reader of this package.
 
     Raises:
         InputError: a reader has been registered, and the file is unreadable or has an unknown format.
@@ -160,8 +161,8 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
 
 
 def _with_unit_of_name(channel: Channel) -> Channel:
-    """Return the channel with the unit that its name states, as in ``height_nm``. The channel is unchanged if
-    the file states the unit, or if the name states none.
+    """If the file does not state the unit of a channel, take the unit from the name of the channel, as in
+    ``height_nm``, and return the channel with this unit. Otherwise return the channel unchanged.
     """
     ends = _NAMED_UNIT.search(channel.name)
     return replace(channel, unit=ends[1]) if ends and channel.unit is None else channel
@@ -219,8 +220,8 @@ def _settle_unit(
 
 
 def _to_um(values: Array, factor: float) -> Array:
-    """Convert the values to µm by multiplying them by the factor. A factor below one is applied as a
-    division, because only then 100 nm become exactly 0.1 µm.
+    """Convert the values to µm by multiplying them by the factor. If the factor is below one, the values are
+    divided by its inverse, so that 100 nm become exactly 0.1 µm.
     """
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor

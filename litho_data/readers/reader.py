@@ -58,10 +58,10 @@ class Channel:
         fast_axis: axis along which the tip moved fast; None if the file does not state it.
         header: everything that the file states about the channel, as strings.
         problem: the reason why the channel cannot be read; empty if it can be read.
-        x_is: what in the file runs along x, in words, such as "a row of the file".
+        x_is: the part of the file that runs along x, in words, such as "a row of the file".
         extent: side lengths (y, x) of the map from edge to edge, if the file states them without a unit.
-        words: words that stand in the file in place of numbers, each with the line where it first occurs.
-            Pixels with such a word are NaN.
+        words: the words that the file contains in place of numbers. Each is mapped to the line where it first
+            occurs. Pixels with such a word are NaN.
         notes: warnings for the user of the map.
     """
 
@@ -115,7 +115,7 @@ class Reader:
         read_channels: function ``read_channels(path)`` that returns the channels of a file, in the order of
             the file. If this function or a channel's ``load`` raises any exception, the user sees a one-line
             message about the file.
-        parsers: names of the modules of other projects that ``read_channels`` uses. If any are named,
+        parsers: names of the modules of other projects that ``read_channels`` uses. If there are any,
             ``read_channels`` runs in a child process within limits of time and memory. The function must then
             be importable by name, and its results must be picklable.
     """
@@ -142,7 +142,9 @@ def _refuse(problem: str) -> Loaded:
 
 
 def in_memory(values: Array) -> Callable[[], Loaded]:
-    """Return a function for ``Channel.load`` that returns a copy of a map that has already been read."""
+    """Make the function ``Channel.load`` for a map that has already been read. The function returns a copy of
+    the map.
+    """
     return partial(_copied, values)
 
 

@@ -38,8 +38,8 @@ def formats() -> tuple[str, ...]:
 def register_reader(reader: Reader) -> Reader:
     """Register a reader for another format. The new reader is tried before the existing readers.
 
-    A build may start several processes, and each of them must register the reader. Therefore, call this
-    function in a plug-in, or at the top level of the script that starts the build.
+    The build of a dataset may start several processes, and each of them must register the reader. Therefore,
+    call this function in a plug-in, or at the top level of the script that starts the build.
 
     Raises:
         InputError: a format of that name already exists.
@@ -57,7 +57,7 @@ def registered() -> dict[str, str]:
 
 
 def reader_of(format: str) -> Reader:
-    """Return the reader of that name.
+    """Return the reader of the format with the given name.
 
     Raises:
         InputError: there is no reader of that name.

@@ -36,7 +36,8 @@ def _older(raw: bytes) -> tuple[Array, float, float, float]:
     """Read a DSAA or DSBB file. Return the heights, the steps along y and x, and the value that marks blank
     pixels.
 
-    The file states the numbers of columns and rows, followed by the ranges of x, y and z and the heights.
+    The file contains, in this order, the numbers of columns and rows, the ranges of x, y and z, and the
+    heights.
     """
     if raw.startswith(b"DSAA"):
         numbers = np.array(raw.split()[1:], dtype=float)

@@ -22,7 +22,8 @@ _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _LOOKED_AT = 400
 _FEWEST_NULS = 0.8
-# A line that repeats a single word at least this many times is a row of missing pixels.
+# A line of at least this many cells is a row if all words in it are equal, because such a word marks missing
+# pixels.
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
 # Cells that contain a comma are matched too. Otherwise, their closing quotation mark would count as the
@@ -58,8 +59,8 @@ class Block:
     """A block of consecutive lines of numbers, with the header that stands above it.
 
     ``header`` maps the keys in the header's lines to their values, and ``words`` contains these lines
-    unchanged. ``rows`` contains the lines of numbers as text. ``first_line`` is the line number, in the file,
-    of the first of these rows.
+    unchanged. ``rows`` contains the lines of numbers as text. ``first_line`` is the number of the line in the
+    file that contains the first row.
     """
 
     header: dict[str, str]
@@ -68,8 +69,9 @@ class Block:
     rows: list[str] = field(default_factory=list)
 
     def first(self, *keys: str) -> str:
-        """Return the header's value for the first of the given keys that the header contains, or an empty
-        text if it contains none of them. Each key also stands for its translations in ``words.toml``.
+        """Search the header for the keys, in the given order, and return the value of the first key found. If
+        the header contains none of the keys, return an empty text. Each key also stands for its translations
+        in ``words.toml``.
         """
         lower = {_NO_LETTER.sub("", key.lower()): value for key, value in self.header.items()}
         return next((lower[name] for key in keys for name in _KEYS.get(key, [key]) if name in lower), "")
@@ -134,7 +136,7 @@ class Block:
 
 
 def refuse_scales(header: Mapping[str, str]) -> None:
-    """Reject a header that scales the values in a way that no known format uses.
+    """Reject a header that contains a scale of unknown meaning.
 
     Raises:
         InputError: the header contains a scale of an unknown kind.
@@ -150,8 +152,8 @@ def read_text(path: Path) -> str:
     The encoding may be UTF-8, UTF-16 or Latin-1.
 
     Raises:
-        InputError: the file is not valid UTF-16 although it begins like it, or it contains bytes that do not
-            occur in text (the message then names the line).
+        InputError: the file begins like UTF-16 but is not valid UTF-16, or it contains bytes that do not
+            occur in text. In the second case, the message names the line.
     """
     raw = path.read_bytes()
     halves = {"utf-16-be": raw[:_LOOKED_AT:2], "utf-16-le": raw[1:_LOOKED_AT:2]}
@@ -182,9 +184,8 @@ def without_quotes(text: str) -> str:
 def blocks_of(text: str) -> list[Block]:
     """Find the blocks of numbers in a text. A blank line or a line of words ends a block.
 
-    A line counts as a line of words only if less than half of its cells are numbers. Otherwise it is a row of
-    the block, with words in place of some numbers. If every second line is blank, all rows belong to one
-    block.
+    The function ``is_row`` decides whether a line is a row of numbers or a line of words. A row may contain
+    words in place of some numbers. If every second line is blank, all rows belong to one block.
     """
     found = list(_blocks(text))
     if len(found) > 1 and all(len(one.rows) == 1 and not one.words for one in found[1:]):
@@ -222,10 +223,11 @@ def header_of(text: str) -> Block:
 
 
 def is_row(line: str) -> bool:
-    """Return whether a line is a row of numbers, which means that it is not a comment and that at least half
-    of its cells are numbers.
+    """Return whether a line is a row of numbers. This is the case if at least half of its cells are numbers,
+    and if the line is not a comment and does not consist of a key and its value.
 
-    A line that repeats a single word is a row of missing pixels, unless the word is a unit.
+    A word in a row marks a missing pixel. A line of at least four cells is therefore also a row if all words
+    in it are equal, unless this word is a unit.
     """
     if _COMMENT.match(line) or not line.strip():
         return False

@@ -1,5 +1,5 @@
-"""Find the coordinates in a table of numbers. Coordinates are axes in the first row and column, or columns
-with the x and y of points that fill a grid.
+"""Find the coordinates in a table of numbers. The coordinates are either the first row and column of a
+matrix, or two columns with the x and y of points that fill a grid.
 """
 
 import re
@@ -14,9 +14,9 @@ from litho_data.foundation import YX, Array, InputError, is_length, um_per
 # step.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
-# If only the first row or only the first column is evenly spaced, it is taken as an axis only if it has at
-# least this many numbers. A first row and column with uneven steps are rejected as axes only if each has this
-# many numbers.
+# If only one of the first row and the first column is evenly spaced, it must have at least this many numbers
+# to be taken as an axis. If both look like axes with uneven steps, the table is rejected only if each has at
+# least this many numbers.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
 _COLUMN = re.compile(
@@ -47,7 +47,8 @@ class Map:
 
 
 def without_axes(values: Array, words: Sequence[str]) -> Map:
-    """Remove from a matrix the first row and column if they contain coordinates or pixel numbers.
+    """Remove the first row, the first column or both from a matrix, if they contain coordinates or pixel
+    numbers.
 
     Evenly spaced numbers are taken as coordinates, unless the next row or column has the same spacing. In
     that case, both lines belong to the map, because neighbouring lines of a map are alike. The numbers 0, 1,
@@ -123,10 +124,10 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 
 
 def _columns(words: Sequence[str], count: int) -> list[int]:
-    """Return the numbers of the columns that contain x, y and z.
+    """Return the indices, from 0, of the columns that contain x, y and z.
 
     The columns are identified by the words above them. Without such words, the columns of a table with three
-    columns are taken as x, y and z. In all other cases, the list is empty.
+    columns are taken as x, y and z. For any other table, the list is empty.
     """
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))

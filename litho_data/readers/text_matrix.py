@@ -88,7 +88,7 @@ def write_text_matrix(path: str | Path, height_um: Array) -> None:
 
     Args:
         path: the file to write.
-        height_um: finite heights in µm, of less than 10 m, shape (ny, nx).
+        height_um: heights in µm, shape (ny, nx), finite and smaller than 10 m.
 
     Raises:
         InputError: a height is NaN or infinite, which the format cannot hold.

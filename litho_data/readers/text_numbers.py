@@ -1,5 +1,5 @@
-"""Convert rows of text to numbers. The rows may have different kinds of separators, decimal commas, and words
-in place of numbers. Damaged rows are detected.
+"""Convert rows of text to numbers. The cells of a row are separated by blanks, tabs, semicolons or commas.
+Numbers may have decimal commas, and words may stand in place of numbers. Damaged rows are detected.
 """
 
 import io
@@ -27,9 +27,9 @@ _TRUNCATED = "the file may be truncated"
 class Table:
     """A table of numbers read from text.
 
-    ``values`` has shape (rows, columns), with NaN in place of words. ``words`` maps every word in the table
-    to the line where it first occurs. A word in the first cell is left out. ``corner`` is the word in the
-    first cell, or None.
+    ``values`` has shape (rows, columns), with NaN in place of words. ``words`` maps every word in the table,
+    except a word in the first cell, to the line where it first occurs. ``corner`` is the word in the first
+    cell, or None if this cell contains a number.
     """
 
     values: Array
@@ -67,14 +67,14 @@ def _numbers(text: str, first_line: int) -> Table:
 
 def _plain(text: str, first_line: int) -> tuple[str, str | None]:
     """Return the text with decimal points in place of decimal commas, and the separator between its cells. If
-    the separator is None, the cells are separated by any blanks.
+    the separator is None, the cells are separated by blanks of any kind and number.
 
     Commas are taken as separators only if nothing else separates the cells. Otherwise they are decimal
     commas, and the text must not contain decimal points.
 
     Raises:
-        InputError: the text contains commas in addition to another separator, as in ``1,234.5;2,345.6``;
-            commas that may be either decimal commas or separators; or commas that may separate thousands.
+        InputError: the text contains another separator in addition to commas, as in ``1,234.5;2,345.6``; the
+            commas may be either decimal commas or separators; or the commas may separate thousands.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
     for mark in "\t;,":  # remove a separator that stands at the end, or at the start, of every row

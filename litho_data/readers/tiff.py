@@ -38,10 +38,10 @@ def read_channels(path: Path) -> list[Channel]:
     """Read one channel per page. In an RGB page, the three samples of each pixel must be identical.
 
     The pixel size is taken from OME metadata. Without OME metadata, it is taken from the resolution tags, but
-    only if ImageJ's metadata name the unit of these tags. Otherwise, these tags usually describe a print on
-    paper and not the sample. If ImageJ or GDAL stored a calibration of the values, it is applied. Without a
-    calibration, values are returned as stored. GDAL's no-data value marks missing pixels. Copies of a page at
-    reduced resolution are skipped.
+    only if ImageJ's metadata name the unit of these tags. Without such a unit, the resolution tags usually
+    describe a print on paper and not the sample. If ImageJ or GDAL stored a calibration of the values, it is
+    applied. Without a calibration, values are returned as stored. GDAL's no-data value marks missing pixels.
+    Copies of a page at reduced resolution are skipped.
 
     Raises:
         InputError: the file is damaged.
@@ -81,8 +81,8 @@ def require_upright(page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """Recognise the instrument maker's format from the tags of a TIFF file. Return the name that
-    SurfaceTopography gives to this format, or an empty string if no format is recognised.
+    """Recognise the TIFF files of instrument makers by their tags. Return the name that SurfaceTopography
+    uses for the maker's format, or an empty string if the file is not recognised.
     """
     try:
         with open_tiff(path) as file:
@@ -134,8 +134,8 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
     offset.
 
     Raises:
-        InputError: ImageJ's calibration is not a straight line, or the page's description contains a scale
-            of an unknown kind.
+        InputError: ImageJ's calibration is not linear, or the page's description contains a scale of an
+            unknown kind.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
@@ -175,9 +175,9 @@ def _plain_unit(unit: Any) -> str:
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
     """Read the pixel size (y, x) in µm of every page from OME metadata. Lengths without a unit are in µm.
 
-    The pages of the first image come first, then those of the second, and so on. The number of pages of an
-    image is the product of its sizes in z, channel and time. If these numbers do not add up to the number of
-    pages in the file, every entry of the result is None.
+    In the file, the pages of the first image are followed by the pages of the second image, and so on. The
+    number of pages of an image is the product of its sizes in z, channel and time. If these numbers do not
+    add up to the number of pages in the file, every entry of the result is None.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):

@@ -33,8 +33,8 @@ _STARTS = {
 _ZIP, _HDF5 = b"PK\x03\x04", b"\x89HDF\r\n\x1a\n"
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
-# The kinds of Digital Surf files that do not contain a single surface (series, layers, pictures, curves,
-# spectra), and the position in the file where the kind is stored.
+# The kinds of Digital Surf files that contain anything but exactly one surface (series, layers, pictures,
+# curves, spectra), and the position in the file where the kind is stored.
 _NO_SURFACES, _SURFACE_KIND_AT = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 15, 20, 21), 18
 _IGOR_HEADERS = {1: 8 + 110, 2: 16 + 110, 3: 20 + 110, 5: 64 + 320}
 _IGOR_5_SIZES = "15I"
@@ -61,9 +61,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """Return the names of the formats whose signature the file has. They are the names that SurfaceTopography
-    uses.
-    """
+    """Return the names, as used by SurfaceTopography, of the formats whose signature the file has."""
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
@@ -92,8 +90,8 @@ def _is_igor(head: bytes) -> bool:
 def _recognise(path: Path) -> str:
     """Return the name that SurfaceTopography uses for the file's format.
 
-    Several formats may share a signature. The result is the first format with the file's signature whose
-    reader can open the file.
+    Several formats may share a signature. The readers of these formats try to open the file, one after the
+    other, and the result is the format of the first reader that succeeds.
 
     Raises:
         InputError: the file has no known signature, or no reader for its signature can open it.
@@ -165,7 +163,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     """Load the heights as an array indexed [y, x] with row 0 at the top.
 
-    SurfaceTopography indexes heights [x, y], with y downwards, so they are transposed here.
+    SurfaceTopography returns an array indexed [x, y] in which y grows downwards, so the array is transposed.
     """
     # SurfaceTopography requires a size even if the file states none. The heights do not depend on this size.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
@@ -196,8 +194,8 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 def _fast_axis(header: dict[str, str]) -> Axis | None:
     """Return ``"x"`` if the header of an Asylum file gives a scan angle of 0° or 180°. Otherwise return None.
 
-    At other angles, the file does not say whether the lines follow the axes of the scanner or those of the
-    scan, so the caller must state the fast axis.
+    At other angles, the file does not say whether the scan lines run along an axis of the scanner or along an
+    axis of the scan. The caller must then state the fast axis.
     """
     try:
         angle = float(header["ScanAngle"]) % 180

@@ -23,12 +23,12 @@ def read_channels(path: Path) -> list[Channel]:
     """Return one channel per block of numbers. A flag in the first line says whether heights are in nm or in
     wavelengths.
 
-    In this format, a line of the file contains a column of the map, from bottom to top. However, if the
-    numbers of lines and cells show that each line contains a row of the map, the file is read row by row.
+    A line of the file usually contains a column of the map, from bottom to top. If the numbers of lines and
+    cells fit only the opposite order, each line is read as a row of the map.
 
     Raises:
-        InputError: the header does not state the wavelength although heights are in wavelengths, or a block
-            does not have the size that the header states.
+        InputError: heights are in wavelengths but the header does not state the wavelength, or a block does
+            not have the size that the header states.
     """
     lines = read_text(path).split("\n")
     in_nm = lines[0].removeprefix(_MAGIC).split()[1:2] == ["1"]
