@@ -1,5 +1,5 @@
-"""Describe the bend of a scan: the smooth displacement, caused by a nonlinear scanner, of the scan's points
-from their nominal to their true positions.
+"""Describe the bend of a scan. A nonlinear scanner displaces the points of a scan smoothly. The bend is the
+displacement of the points from their nominal to their true positions.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from litho_data.foundation import YX, Array, Shape
 
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
-# ``Bend.undo`` iterates until its steps are below this share of half the scan's side, which is far less than
-# a thousandth of a pixel.
+# ``Bend.undo`` ends when its steps are below this share of half the scan's shorter side, i.e. far below a
+# thousandth of a pixel.
 _SETTLED = 1e-9
 # Largest number of steps in ``Bend.undo``. A bend with a slope of 0.1 takes 10 steps, one with a slope of 0.9
 # takes 200.
@@ -27,14 +27,14 @@ class Bend:
     """The bend of a scan, i.e. the displacement of the scan's points from their nominal to their true
     positions.
 
-    The displacement is a polynomial of u and v. These are the coordinates along x and y, scaled so that they
-    run from -1 to 1 over the frame of the scan.
+    The displacement is a polynomial of u and v. The coordinates u (along x) and v (along y) run from -1 to 1
+    over the frame of the scan.
 
     ``amount`` has shape (2, 3), with one row for the displacement along x and one for that along y. Its
     columns are the coefficients of u² - 1/3, uv and v² - 1/3. For a scanner that creeps, ``amount`` has shape
     (2, 11). Columns 3 to 10 are then the coefficients of the Legendre polynomials P₃(u), P₃(v), P₄(u), …
-    P₆(v). The mean of every term over the frame is zero, and no term contains a linear part. The affine map
-    that fits a bend best over the frame is therefore zero. ``middle`` and ``half`` contain the centre (x, y)
+    P₆(v). Over the frame, every term has a mean of zero and is orthogonal to u and v. The affine part of the
+    displacement, fitted over the frame, is therefore zero. ``middle`` and ``half`` contain the centre (x, y)
     and half the size (x, y) of the frame, in the unit of ``amount``, so that u = (x - middle) / half.
     """
 
@@ -96,8 +96,8 @@ class Bend:
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the nominal positions (x, y) of the points whose true positions are given. This method is
-        the inverse of ``straighten``, and is exact if ``slope`` is below 1.
+        """Return the nominal positions (x, y) of the points whose true positions are given. This method
+        inverts ``straighten`` by iteration, which converges if ``slope`` is below 1.
         """
         at_x, at_y = x, y
         for _ in range(_STEPS):
@@ -115,10 +115,10 @@ class Bend:
 
     @property
     def slope(self) -> float:
-        """Return the largest change of the displacement per unit of length that occurs anywhere in the frame.
+        """Return the largest change of the displacement per unit of length in the frame.
 
-        At a point, this change is the spectral norm of the displacement's gradient, which bounds the local
-        stretch and rotation. A bend with a slope of 1 or more may fold the scan.
+        The change at a point is the spectral norm of the displacement's gradient. It bounds the local stretch
+        and rotation. A bend with a slope of 1 or more may fold the scan.
         """
         # The gradient is computed by differences on a grid. The differences are exact for a quadratic bend,
         # and accurate to a thousandth for creep.
@@ -156,7 +156,7 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def fit_bent_affine(
     points: Array, images: Array, middle: Array, half: Array, degree: int = 2
 ) -> tuple[Array, Bend]:
-    """Fit an affine map and a bend that together map points to given images, by least squares.
+    """Fit, by least squares, an affine map and a bend that together map points to given positions.
 
     The model is ``images`` ≈ affine(``points`` + bend(``points``)).
 

@@ -1,5 +1,5 @@
-"""Find the orientation and polarity of a scan, and a warp that is accurate to a few pixels. Keypoints are
-matched, or the scan is correlated with the layout.
+"""Find the orientation and polarity of a scan, and a warp that is accurate to a few pixels. The scan is
+correlated with the layout, and keypoints are matched where this is possible.
 """
 
 from dataclasses import dataclass, replace
@@ -79,8 +79,8 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """Return the best hypothesis. If the upright hypothesis fits about equally well, which happens on a
-    symmetric layout, return the upright hypothesis.
+    """Return the best hypothesis. On a symmetric layout, several hypotheses fit about equally well. If the
+    upright hypothesis is among them, return it instead.
     """
     best = hypotheses[0]
     for hypothesis in hypotheses:
@@ -93,8 +93,9 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
     """Return the orientations and polarities in which to look for keypoints.
 
-    ORB keypoints match in any rotation. Therefore, at most four combinations of mirroring and polarity must
-    be tried. All four are tried if the correlation does not clearly determine the orientation.
+    If the correlation clearly determines the orientation, only this orientation is returned. Otherwise, one
+    orientation is returned for each of the four combinations of mirroring and polarity. One is enough,
+    because ORB keypoints match in any rotation.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]

@@ -2,9 +2,9 @@
 fits such scans.
 
 A bend displaces the image by a quadratic function of position. A scanner creeps while it is still settling.
-Creep displaces the scan lines along both axes, by a smooth function of the position along the slow axis
-alone. A straight warp absorbs the linear part of creep. The nonlinear part, about a tenth of the creep,
-distorts the image of the print, and creep can be detected only by this distortion.
+Creep displaces whole scan lines along x and y. The displacement is a smooth function of the position along
+the slow axis only. A straight warp absorbs the linear part of creep. The nonlinear part, about a tenth of the
+creep, distorts the image of the print, and creep can be detected only by this distortion.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ITERATIONS = 30
 _SETTLED_PX = 5e-3
 _FOLD_PX = 64
 # Creep is accepted if the p-value of the test on held-out blocks is below this value. The p-value is the
-# probability that the blocks of a scan without creep favour creep as clearly by chance.
+# probability that, in a scan without creep, the blocks favour creep this clearly by chance.
 _CHANCE = 0.01
 _BACKGROUND = 6
 
@@ -45,15 +45,17 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
     Creep displaces the image, along x and along y, by polynomials of degree 6 in the coordinate along the
     slow axis. The two polynomials add ten coefficients to those of the affine map. Creep is accepted only if
     it predicts held-out blocks better than the straight warp does. For this test, the field is divided into
-    two halves, like the black and the white squares of a chequerboard whose squares have sides of 64 px. The
-    warps with and without creep are fitted to each half, and each fit predicts the other half.
+    squares with sides of 64 px. The squares form two halves, like the black and the white squares of a
+    chequerboard. The warps with and without creep are fitted to each half, and each fit predicts the other
+    half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: the result of ``refine_pyramid``. Its warp may be wrong by as much as the width that the
-            printed structures have at a quarter of the resolution, where the refinement starts.
-        curve: the distortion to fit: ``quadratic`` for a bend, or, for creep, the number of the oriented
-            scan's slow axis (0 = x, 1 = y). The slow axis runs across the scan lines.
+        straight: the result of ``refine_pyramid``. The refinement starts at a quarter of the resolution. The
+            position error of this warp may therefore be as large as the width of the printed structures at
+            that resolution.
+        curve: the distortion to fit. ``quadratic`` stands for a bend. The number of the oriented scan's slow
+            axis (0 = x, 1 = y) stands for creep. The slow axis runs across the scan lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -88,13 +90,13 @@ def _from_coarse_to_fine(
 
 
 def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
-    """Subtract from the scan the quadratic surface that its heights contain and the topography does not
+    """Subtract the bow of the scan, i.e. the quadratic surface in its heights that the topography does not
     explain.
 
-    The bow of the scan is quadratic in the scan's frame. In the layout's frame, the scan is straightened, so
-    its bow is no longer quadratic. A quadratic background in the layout's frame could not describe this bow,
-    and would distort the fit of the bend. If the print itself contains a quadratic surface that the
-    topography does not explain, this surface is subtracted as well.
+    The bow is quadratic in the scan's frame. It is not quadratic in the layout's frame, where the scan is
+    straightened. A quadratic background in the layout's frame could not describe the bow, and would distort
+    the fit of the bend. If the print itself contains a quadratic surface that the topography does not
+    explain, this surface is subtracted as well.
     """
     from scipy.ndimage import map_coordinates
 
@@ -127,8 +129,9 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # Creep fades along the scan, so a few blocks contribute most of the gain. A rank test is used because it
-    # does not depend on how large the gain of these blocks is.
+    # The gain of a block is the decrease of its squared misfit when creep is added to the warp. Creep fades
+    # along the scan, so the gain is large in only a few blocks. A rank test is used because it does not
+    # depend on how large these gains are.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
@@ -208,8 +211,8 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """Return, at the given points of the scan, the terms whose weighted sum is the displacement along an
-    axis. They are 1, u, v, and the terms of the bend or the creep.
+    """Return the terms of the displacement at the given points of the scan. The displacement along an axis is
+    a weighted sum of these terms. They are 1, u, v, and the terms of the bend or the creep.
     """
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]

@@ -1,8 +1,8 @@
 """Find defects, i.e. areas where a scan does not show the print because of dust, collapsed or missing parts,
 or lifted film.
 
-If a warp is fitted by least squares, such an area can shift the warp by whole pixels. A defect is a connected
-area where the heights differ from what the layout predicts by many times the usual difference.
+Such an area can shift a least-squares fit of the warp by whole pixels. A defect is found as a connected area
+where heights and prediction differ by many times their usual difference.
 """
 
 from dataclasses import replace
@@ -19,8 +19,8 @@ from litho_data.register.topography import fill_gaps, quadratic_basis
 # Limits of the misfit (heights minus prediction), in units of its robust standard deviation. An area is
 # suspected if its misfit exceeds the first value somewhere. The area extends to where the misfit falls to the
 # second value. The area is a defect if its misfit still reaches the third value after the warp has been
-# fitted without the area. Printer effects that a Gaussian blur does not describe stay below the third value:
-# on the measured prints, they reach 13.5.
+# fitted without the area. Some effects of the printer are not described by a Gaussian blur. On the measured
+# prints, their misfit reaches 13.5, which is below the third value.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
@@ -57,7 +57,7 @@ def refine_around_defects(
 
     This is done in several rounds. Each round finds the defects with the warp of the round before, and fits a
     new warp to all other pixels, starting from the coarse warp ``start``. The rounds end when the positions
-    of the corners no longer change.
+    of the corners no longer change, or after six rounds.
 
     Args:
         plain: the fit to all pixels, ``refine_pyramid(scan, layout_level, start, model)``.
@@ -65,7 +65,8 @@ def refine_around_defects(
 
     Returns:
         The fit to the pixels outside the defects, and a bool mask of shape (ny, nx) that is true at the
-        layout pixels that are defects. If there are no defects, the result is ``plain`` and None.
+        layout pixels that are defects. The result is ``plain`` and None if there are no defects, or if the
+        fit without them does not converge or has a lower correlation than ``plain``.
     """
     fine, defects = plain, None
     for attempt in range(_ROUNDS):
@@ -95,10 +96,11 @@ def refine_around_defects(
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     """Find the areas where the scan does not show the print, and the largest misfit in these areas.
 
-    The misfit is the height of the scan, on the layout's pixels, minus a prediction. The prediction is a free
-    function of the predicted topography (piecewise linear with 8 knots) plus a quadratic background, fitted
-    with Tukey's weights. An area is found if it is connected, has at least 30 pixels, and its misfit exceeds
-    3 sigma everywhere and 8 sigma somewhere.
+    The misfit is the height of the scan, on the layout's pixels, minus a prediction. The prediction is the
+    sum of a piecewise linear function of the predicted topography (with 8 knots) and a quadratic background.
+    Both are fitted with Tukey's weights. Sigma is the robust standard deviation of the misfit. A connected
+    area is found if it has at least 30 pixels and its misfit exceeds 3 sigma everywhere and 8 sigma
+    somewhere. If such areas cover more than 45 % of the field, none is found.
 
     Args:
         scan: smoothed heights with shape (ny, nx), in the same frame as ``fine.scan``. Heights at defects are
@@ -107,7 +109,7 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
 
     Returns:
         A bool mask of shape (ny, nx) that is true at the layout pixels in the areas, each widened by a
-        margin; and the largest misfit in the areas, in units of the misfit's robust standard deviation.
+        margin; and the largest misfit in the areas, in units of sigma.
     """
     from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label, sum_labels
 

@@ -28,8 +28,8 @@ class BlockShifts:
     shape (n, 2), with columns x and y, in layout pixels.
 
     ``middle_px`` contains the centres of the blocks. ``shift_px`` contains, for every block, the displacement
-    of its content from the position that the warp predicts. ``held_out_px`` contains the displacement from
-    the position that a warp fitted without the block predicts.
+    of its content from the position that the warp predicts. ``held_out_px`` contains the same displacement
+    for a warp that was fitted without the block.
     """
 
     middle_px: Array
@@ -44,23 +44,23 @@ class BlockShifts:
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Average the shifts of all blocks at the same position along an axis, and return the largest of
-        these means minus the smallest.
+        """Average the shifts of all blocks that have the same position along an axis. Return the largest
+        minus the smallest mean, or NaN if there are fewer than three positions.
 
         Args:
             axis: the axis of the shifts (0 = x, 1 = y).
             along: the axis along which the positions are taken.
 
         If the scanner is linear and the kind of warp is general enough, the shifts vary only by noise. A
-        larger variation means that the scanner's axis is not linear or that the scanner creeps, which no warp
-        of ``LADDER`` describes.
+        larger variation means that an axis of the scanner is not linear or that the scanner creeps. No warp
+        of ``LADDER`` describes these two effects.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Return whether the mean shift of the blocks varies with the position along this axis by a relevant
-        amount, and by clearly more than the scatter of the shifts explains.
+        """Return whether the mean shift of the blocks depends on the position along this axis. The means must
+        differ by a relevant amount, and by clearly more than their standard errors.
         """
         for axis in (0, 1):
             groups = self._by_place(axis, along)
@@ -81,8 +81,8 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
-    """Measure the shift of every block of the field relative to the position that the warp predicts, and
-    relative to the position that a warp fitted without the block predicts.
+    """Measure the shift of every block of the field relative to two predicted positions. One is predicted by
+    the warp, and the other by a warp that is fitted without the block.
 
     Args:
         refinement: the fit of the warp.
@@ -147,8 +147,8 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 def height_correlation(height: Array, layout_level: Array) -> float:
     """Return the Pearson correlation of the layout with the heights, which are smoothed with sigma = 1 px.
 
-    Layout and heights have shape (ny, nx), and heights may be NaN. Only pixels with a known height outside
-    the layout's border (see ``interior_of``) are used.
+    Layout and heights have shape (ny, nx), and heights may be NaN. Only pixels that have a known height and
+    do not lie in the border of the layout (see ``interior_of``) are used.
     """
     chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:
@@ -157,8 +157,8 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 
 def _peak(score: Array) -> Array:
-    """Return the position (x, y) of the largest score. A position that does not lie on the border is refined
-    to a fraction of a pixel.
+    """Return the position (x, y) of the largest score. Along each axis, the position is refined to a fraction
+    of a pixel, unless it lies at the border.
     """
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)

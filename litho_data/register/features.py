@@ -26,7 +26,7 @@ class Correspondence:
     ``layout_points`` and ``scan_points`` contain the pixel indices (x, y) of the matched keypoints, in arrays
     of shape (n, 2). ``inlier`` says which matches agree with ``layout_to_scan`` within ``INLIER_PX``.
     ``hull_px2`` is the area, in layout pixels, of the convex hull of these inliers. ``keypoints`` is the
-    number of keypoints found in the layout or in the scan, whichever is smaller.
+    smaller of two numbers: the keypoints found in the layout, and the keypoints found in the scan.
     """
 
     keypoints: int
@@ -45,8 +45,8 @@ class Correspondence:
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
     def reprojection_px(self, layout_to_scan: Array, bend: Bend | None = None) -> float:
-        """Return the root mean square distance, in scan pixels, between the inliers in the scan and the
-        positions to which the warp maps the inliers in the layout.
+        """Map the inliers of the layout into the scan with the warp. Return the root mean square of their
+        distances, in scan pixels, from the matching inliers of the scan.
 
         If a bend is given, the distances are measured in the straightened scan.
         """

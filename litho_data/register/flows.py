@@ -1,4 +1,5 @@
-"""Define the generators of every kind of warp, and the velocities (flows) that the generators give to points.
+"""Define the generators of every kind of warp, and compute the velocities (flows) of points under a
+generator.
 
 The kinds of warp form a ladder: each kind contains all kinds before it.
 """
@@ -49,10 +50,11 @@ def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield, for each of the first ``count`` generators, the velocities along x and along y of the points (x,
-    y).
+    """For each of the first ``count`` generators, yield the velocities of the points (x, y) along x and along
+    y.
 
-    If ``count`` is ``BENT_COUNT``, yield the velocities of all affine and quadratic flows.
+    If ``count`` is ``BENT_COUNT``, yield the velocities of all eight generators and of four quadratic flows.
+    Every affine or quadratic flow is a combination of these twelve.
     """
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)

@@ -11,9 +11,9 @@ from litho_data.foundation import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
-# For each name, three flags tell whether to transpose the scan, then whether to reverse the order of its
-# rows, then whether to reverse the order of its columns. These operations give the scan the orientation of
-# the layout.
+# Each name has three flags, one for each of three operations: to transpose the scan, to reverse the order of
+# its rows, and to reverse the order of its columns. The operations are applied in this order, and give the
+# scan the orientation of the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),
@@ -79,7 +79,7 @@ def nearest_orientation(linear: Array) -> str:
 
 
 def apply_transform(matrix: Array, points: Array) -> Array:
-    """Return the images of points (x, y) under a 3×3 matrix. Points and images have shape (n, 2)."""
+    """Map points (x, y) by a 3×3 matrix. The points and the result have shape (n, 2)."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
@@ -89,8 +89,8 @@ def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[
     image.
 
     The matrix acts on pixel indices. The result is a pair of arrays: the rows and the columns of the
-    positions. If ``bend`` is given, the target image is bent, and the matrix gives the true positions of its
-    points. The function then returns the nominal positions, at which the points appear in the bent image.
+    positions. ``bend`` is the bend of the target image. If it is given, the matrix gives true positions, and
+    the function returns the nominal positions, at which the points appear in the bent image.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]

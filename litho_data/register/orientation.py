@@ -72,7 +72,7 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 
 def rival_alignment(registered: Array, topography: Array) -> float:
     """Return the largest correlation of scan and topography at a competing shift, divided by their
-    correlation without a shift.
+    correlation at zero shift.
 
     A competing shift is a local maximum of the correlation that lies at least a sixteenth of the field away
     from zero shift. If the topography is passed in place of the registered scan, the result says how strongly
@@ -131,15 +131,16 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
 
     Returns:
         Two arrays: the correlation, and the number of overlapping pixels. Both arrays are indexed by the
-        shift modulo their shape. The correlation is NaN if less than the share ``MIN_OVERLAP`` of the smaller
-        image overlaps, or if one image is constant in the overlap.
+        shift modulo their shape. The correlation is NaN if the overlap is smaller than the share
+        ``MIN_OVERLAP`` of the smaller image, or if one image is constant in the overlap.
     """
     return next(_correlations(fixed, [moving]))
 
 
 def _correlations(fixed: Array, moving: Iterable[Array]) -> Iterator[tuple[Array, Array]]:
-    """Yield ``masked_correlation(fixed, one)`` for each of several images. Terms that depend only on the
-    fixed image and on an image's mask are computed once for all images with the same shape and mask.
+    """Yield ``masked_correlation(fixed, one)`` for each of several images. Some terms depend only on the
+    fixed image and the mask of the other image. They are computed once for all images with the same shape and
+    mask.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 

@@ -121,9 +121,8 @@ def match_blur(
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
     """Return the warp of the kind ``model`` that approximates a given warp best.
 
-    If ``model`` is affine, the result agrees with the given warp to first order at the centre of the field.
-    For a simpler kind, the given warp moves the four corners, and the result is fitted to their new
-    positions.
+    If ``model`` is affine, the result agrees with the given warp to first order at the centre of the field. A
+    warp of a simpler kind is fitted to the positions to which the given warp maps the four corners.
     """
     if model == "homography":
         return matrix
@@ -159,15 +158,15 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """Fit every kind of warp, and return the fit of the simplest kind for which no more general kind is
-    better on held-out blocks.
+    """Fit every kind of warp. Return the fit of the simplest kind that predicts held-out blocks as well as
+    every more general kind.
 
     Args:
-        fine: a converged affine fit. Every other fit starts from the warp of its kind that approximates this
-            fit best.
+        fine: a converged affine fit. The fit of every kind starts from the warp of this kind that
+            approximates the affine warp best.
 
-    A more general kind is better if its residual energy in held-out blocks is lower, on average over the
-    blocks, by more than three standard errors of this average.
+    A more general kind counts as better only if it lowers the residual energy in held-out blocks, and the
+    mean decrease over the blocks exceeds three times its standard error.
     """
     shape = fine.topography.shape
     start = fine.refinement.layout_to_scan

@@ -135,7 +135,7 @@ def refine(
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
-    """Return the inner products ``gram`` of ``Refinement`` for a scan that is already aligned with the
+    """Return the inner products, as in ``Refinement.gram``, for a scan that is already aligned with the
     topography.
 
     Args:
@@ -154,8 +154,8 @@ def in_blocks(gram: Array) -> Array:
     """Sum the inner products over blocks of two by two cells. The result has shape (blocks_y, blocks_x, k,
     k).
 
-    An error of the predicted topography extends over one or two printed features. A block is therefore taken
-    as the smallest area in which the errors are independent of the errors in other blocks.
+    An error of the predicted topography extends over one or two printed features. Blocks of this size are
+    large enough that the errors of different blocks can be taken as independent.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)

@@ -12,9 +12,9 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
-# ``_PHASES`` contains the sub-pixel positions, in scan pixels, over which effects of resampling are averaged.
-# ``_LAGS`` contains the positions, relative to a layout pixel, of the scan pixels whose weights are computed;
-# the phase is added to them.
+# The weights of scan pixels are computed at the distances lag + phase from a layout pixel, in scan pixels,
+# for every lag in ``_LAGS`` and every phase (sub-pixel position) in ``_PHASES``. Effects of resampling are
+# averaged over the phases.
 _PHASES = (np.arange(64) + 0.5) / 64
 _LAGS = np.arange(-128, 129)
 
@@ -45,7 +45,8 @@ def resample_to_layout(
     Returns:
         ``height_um``, the heights in µm as float32, NaN where not valid; and ``valid``, a bool mask. Both
         have the shape ``layout_shape``. A pixel is valid if it lies between pixel centres of the scan, and if
-        no missing pixel of the scan lies within two pixels of it, which is the reach of the spline's kernel.
+        no missing pixel of the scan lies within two scan pixels of it. The kernel of the spline reaches as
+        far as two pixels.
 
     Raises:
         InputError: ``scan_to_layout`` is not an invertible 3×3 matrix, or the scan has no measured pixel.
@@ -74,18 +75,18 @@ def resample_to_layout(
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
-    """Return the variance of white noise (noise that is independent from pixel to pixel) after a scan is
-    resampled, divided by its variance before.
+    """Return the factor by which resampling changes the variance of white noise in a scan (noise that is
+    independent from pixel to pixel).
 
-    The share is a mean over sub-pixel positions.
+    The factor is a mean over sub-pixel positions.
     """
     along_y, along_x = (line_variance_factor(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um)
     return along_y * along_x
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the variance of the scan lines' offsets after a scan is resampled, divided by their variance
-    before. The offsets are assumed to be independent from line to line.
+    """Return the factor by which resampling changes the variance of the offsets of scan lines. The offsets
+    are assumed to be independent from line to line.
 
     ``pitch_um`` is the pitch of the scan across its lines.
     """
@@ -111,7 +112,7 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Return, along one axis, the weights with which the pixels of a scan contribute to one pixel of the
+    """Return the weights with which the pixels of a scan, along one axis, contribute to one pixel of the
     layout.
 
     The weights have shape (phases, lags). The distance of a scan pixel from the layout pixel is lag + phase,

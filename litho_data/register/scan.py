@@ -51,9 +51,9 @@ class Registration:
     scan on the centre of the layout.
 
     ``bend_um`` describes how the scanner bent the scan, and is None for a scan that is not bent. For a bent
-    scan, ``bend_um.straighten`` gives the true positions of points (x_um, y_um), and ``scan_to_layout`` acts
-    on these. This matrix is the affine map closest to the complete map from scan to layout, which includes
-    the bend.
+    scan, ``bend_um.straighten`` gives the true positions of points (x_um, y_um), and ``scan_to_layout`` maps
+    the true positions to the layout. Of all affine maps, this matrix is also closest to the complete map from
+    scan to layout, which includes the bend.
 
     ``defects`` is a bool array of shape (ny, nx) on the layout's pixels. It marks where the scan shows
     something other than the print, such as dust, or collapsed or lifted parts. It is None if nothing is
@@ -87,8 +87,10 @@ def register_scan(
         layout_pitch_um: pitch of the layout in µm.
         scan_pitch_um: pitch (y, x) of the scan in µm. It is needed if ``scan`` is an array.
         model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or ``homography``,
-            each of which contains the one before it. With ``ladder``, every kind is fitted, and the simplest
-            kind is used for which no later kind is better on held-out blocks.
+            each of which contains the one before it. With ``ladder``, every kind is fitted, and the result is
+            the simplest kind that predicts held-out blocks as well as every later kind. With ``affine``,
+            ``homography`` and ``ladder``, a bend or creep may be fitted in addition (see
+            ``Registration.bend_um``).
         fast_axis: the axis along which the tip moved fast. It is used only if the scan does not state it.
             None counts as ``x``.
         seed: seed of the robust estimator and of the bootstrap.
@@ -161,8 +163,8 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Return True if the fit with a bend passed, and its error on held-out blocks is at most half that of the
-    straight fit.
+    """Return whether the fit with a bend passed, and its error on held-out blocks is at most half the error
+    of the straight fit.
     """
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
@@ -216,7 +218,7 @@ class _Case:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
         # The scan as it was read may be rotated or mirrored. In its frame, the bend has other coefficients.
-        # They are fitted to a grid of points and the images of these points in the layout.
+        # These coefficients are fitted to a grid of points and the positions of these points in the layout.
         points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)

@@ -33,8 +33,8 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         sigma_px: sigma of the Gaussian, in pixels.
 
     Returns:
-        The smoothed heights as float64 of shape (ny, nx). In a gap, they are means of the measured pixels
-        around it. A pixel is NaN only if no measured pixel lies within 4 sigma.
+        The smoothed heights as float64 of shape (ny, nx). A pixel in a gap has the weighted mean height of
+        the measured pixels around it. A pixel is NaN only if no measured pixel lies within 4 sigma.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -53,7 +53,7 @@ def fill_gaps(height: Array) -> Array:
 
     In the first three pixels of a gap, the measured heights are continued by point reflection about the
     nearest measured pixel. Slopes therefore continue into the gap, and an interpolating spline does not ring
-    at its border. Farther inside the gap, a pixel has the height of the nearest measured pixel.
+    at the border of the gap. Farther inside the gap, a pixel has the height of the nearest measured pixel.
     """
     from scipy.ndimage import distance_transform_edt
 

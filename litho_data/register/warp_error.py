@@ -2,8 +2,8 @@
 to the print.
 
 Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
-The spread of these fits includes the influence of effects in the heights that the topography does not
-explain, provided that the effects differ from block to block.
+The topography does not explain some effects in the heights. The spread of the fits includes the errors that
+these effects cause, if the effects differ from block to block.
 """
 
 from dataclasses import dataclass
@@ -57,10 +57,10 @@ class WarpError:
         Args:
             levelled: whether the heights were levelled.
 
-        On average, the mean square of a fitted surface exceeds that of the true surface by the variance of
-        the fit. For heights that were not levelled, this variance is therefore subtracted, and the result is
-        0 if the surface is not significant. Levelling also removes a quadratic surface that belongs to the
-        print and its roughness. The size of this missing surface is estimated by the error of the fit. For
+        On average, the mean square of a fitted surface exceeds the mean square of the true surface by the
+        variance of the fit. For heights that were not levelled, this variance is therefore subtracted, and
+        the result is 0 if the surface is not significant. Levelling also removes the quadratic part of the
+        print and of its roughness. The mean square of this part is estimated by the variance of the fit. For
         levelled heights, the result is therefore the sum of the mean squares of the fitted surface and of its
         error.
         """
@@ -97,7 +97,8 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
         height: registered heights, shape (ny, nx), NaN where not valid.
         layout_level: integer levels, shape (ny, nx).
         blur_px: sigma, in layout pixels, of the Gaussian blur with which the topography is predicted.
-        model: the kind of warp in the quality record: a key of ``LADDER``, ``quadratic`` or ``creep``.
+        model: the kind of warp, as stated in the quality record: a key of ``LADDER``, ``quadratic`` or
+            ``creep``.
     """
     shape = height.shape
     smooth = np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan)
