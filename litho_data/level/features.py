@@ -1,5 +1,5 @@
-"""Mark features to which the background must not be fitted, such as particles or structures, and level a scan
-without them.
+"""Mark features, such as particles or structures, and level a scan with a background that is not fitted to
+the features.
 """
 
 from typing import Annotated, Literal
@@ -38,13 +38,13 @@ def mark_features(
     side: Side = "both",
     grow_px: Grown = 0,
 ) -> Array:
-    """Mark the pixels whose height differs from that of the main surface by more than ``threshold`` times the
-    noise sigma.
+    """Mark the pixels whose height differs from the main surface by more than ``threshold`` times the noise
+    sigma.
 
     The height of the main surface is the median over the selected pixels, and the noise sigma is 1.4826 times
-    the median absolute deviation (MAD) from it. Both estimates are reliable only if features cover less than
-    half of the selected pixels. Measured pixels that were not selected are marked too, so the mask contains
-    all pixels that later steps should exclude.
+    the median absolute deviation (MAD) from this median. Both estimates are reliable only if features cover
+    less than half of the selected pixels. Measured pixels that were not selected are marked too, so the mask
+    contains all pixels that later steps should exclude.
 
     Args:
         z: heights in any unit, already levelled, shape (ny, nx).
@@ -76,13 +76,13 @@ def mask_and_relevel(
     side: Side = "both",
     grow_px: Grown = 2,
 ) -> MaskedLevelling:
-    """Level a scan, mark its features, and level it again without the marked pixels, until the marks no
-    longer change.
+    """Level a scan, mark its features, and level it again without the marked pixels. This is repeated until
+    the marks no longer change.
 
     In the first round, the background is a robust polynomial fit (Tukey's biweight). In all later rounds, it
     is a least-squares fit to the unmarked pixels. The whole background, including its constant term, is
-    subtracted, so that the main surface lies at zero. The returned mask marks the same pixels as
-    ``mark_features``.
+    subtracted, so that the main surface lies at zero. As in ``mark_features``, measured pixels that were not
+    selected are marked too.
 
     Raises:
         InputError: a parameter is outside its range, or the features leave too few background pixels.

@@ -1,6 +1,4 @@
-"""Level a scan with the help of its layout, so that slope and bow which belong to the printed structure are
-kept.
-"""
+"""Level a scan with the help of its layout. The slope and the bow of the printed structure are kept."""
 
 from __future__ import annotations
 
@@ -24,8 +22,8 @@ if TYPE_CHECKING:
 # they are raised to this share. The background may nevertheless be well determined. For example, if all
 # pixels between two knots have the same level, only the heights at these knots are undetermined.
 _SINGULAR = 1e-9
-# A background is refused if noise causes in it an error that is larger than this number times the error in a
-# fit without a layout.
+# A background is refused if its error due to noise is larger than this number times the error in a fit
+# without a layout.
 _MOST_LOSS = 1000.0
 # The height as a function of the level has one knot per level, but at most this number of intervals between
 # knots.
@@ -48,12 +46,12 @@ def level_layout_aware(
 ) -> Levelled:
     """Fit the background and the printed structure together, and subtract only the background.
 
-    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g, the height as a function
-    of the level, is a piecewise linear function with one freely fitted value per level. If there are more
-    than 65 levels, 65 values at evenly spaced levels are fitted. A polynomial fit without g would treat the
-    slope of the printed structure as background. The datum (the unknown zero height of the scan) is part of
-    g. The subtracted polynomial therefore has no free constant term, and its mean over the fitted pixels is
-    zero.
+    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level). The function g is the height as a
+    function of the level. It is piecewise linear, and its value at every level is fitted. If there are more
+    than 65 levels, its values at 65 evenly spaced levels are fitted. A polynomial fit without g would treat
+    the slope of the printed structure as background. The datum (the unknown zero height of the scan) is part
+    of g. The subtracted polynomial therefore has no free constant term, and its mean over the fitted pixels
+    is zero.
 
     Args:
         z: heights in any unit, shape (ny, nx).
@@ -65,8 +63,9 @@ def level_layout_aware(
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
-        InputError: the layout has another shape than the scan, does not overlap with it, or cannot be
-            separated from the background because it has the same form, as a ramp does.
+        InputError: the degrees allow only a constant background; or the layout has another shape than the
+            scan, does not overlap with the scan, or has the same form as the background (such as a ramp), so
+            that the two cannot be separated.
     """
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
@@ -89,8 +88,8 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """Select the known pixels, at which ``known`` is true, except those within ``border_px`` of an unknown
-    pixel. If at most a quarter of the known pixels would be left, select all known pixels.
+    """Select the pixels at which ``known`` is true, except pixels within ``border_px`` of a pixel at which it
+    is false. If at most a quarter of the known pixels would be left, select all of them.
     """
     if known.all():
         return known
@@ -115,7 +114,7 @@ def layout_in_scan_frame(
         bend_um: bend of the scan; coordinates are corrected for it before ``scan_to_layout`` is applied.
 
     Returns:
-        A float64 array of shape ``scan_shape``. Each value is that of the nearest layout pixel, because
+        A float64 array of shape ``scan_shape``. Each value is the level of the nearest layout pixel, because
         levels are labels and must not be interpolated.
     """
     points_um = lattice(
@@ -131,8 +130,8 @@ def layout_in_scan_frame(
 
 
 def level_hats(level: Array, top: int) -> Array:
-    """Compute the hat functions of the level. Every function of the level that is linear between the knots is
-    a weighted sum of them.
+    """Evaluate hat functions at the given levels. A continuous function of the level that is linear between
+    the knots is a weighted sum of hat functions.
 
     Each hat is 1 at its own knot and 0 at all others. There is one knot per level from 0 to ``top``, or 65
     evenly spaced knots if there are more levels.
@@ -150,8 +149,9 @@ def level_hats(level: Array, top: int) -> Array:
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Fit background and structure together. Return the Legendre coefficients of the background, and the
-    negative of the sum of squares that the fit explains. The best fit therefore has the lowest value.
+    """Fit background and structure together. Return the Legendre coefficients of the background and a score.
+    The score is the sum of squares that the fit explains, with a negative sign, so the best fit has the
+    lowest score.
     """
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0

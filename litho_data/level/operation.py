@@ -17,8 +17,8 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
 """The classes of the steps that a recipe can contain, keyed by the name of the operation."""
-# Arguments of operations whose values come with the scan, so that they are not settings of a step. Each is
-# mapped to the phrase with which messages name the argument.
+# Arguments of operations that are not settings of a step, because their values come with the scan. Each is
+# mapped to the phrase that names it in messages.
 _OF_SCAN = {
     "pitch_um": "the pixel pitch",
     "layout_level": "the layout in the scan's frame, which only a build finds,",
@@ -40,14 +40,15 @@ class State:
 class Step(BaseModel):
     """Base class of the steps of a recipe. The fields of a step are the arguments of its operation.
 
-    ``masking`` says how the step uses the current mask: the mask made by the last earlier step that marked
-    pixels, or, if there is no such step, the scan's own mask.
+    ``masking`` says how the step uses the current mask. The current mask comes from the last step that marked
+    pixels. If no earlier step marked pixels, it is the scan's own mask.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # Maps the name of each argument whose value comes with the scan to whether the argument is optional.
+    # The names of the arguments whose values come with the scan. Each is mapped to True if the argument is
+    # optional.
     of_scan: ClassVar[dict[str, bool]]
 
     op: str

@@ -19,7 +19,7 @@ def level_plane(z: Array, chosen: Array) -> Levelled:
     """Subtract the tilt of the least-squares plane. The height at the pivot (column nx/2, row ny/2) does not
     change.
 
-    As in Gwyddion, the constant term of the subtracted plane is not the fitted one but -(bx nx + by ny) / 2,
+    As in Gwyddion, the constant term of the subtracted plane is not fitted but set to -(bx nx + by ny) / 2,
     where bx and by are the slopes of the plane in height per pixel. The mean height of the scan therefore
     changes by (bx + by) / 2.
 
@@ -37,10 +37,10 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
     """Subtract the tilt of the prevailing facet. The height at the pivot (column nx/2, row ny/2) does not
     change.
 
-    The tilt is found iteratively by ``prevailing_slope`` from the slopes v of all 2 x 2 cells whose four
-    pixels are selected, with the weights exp(-|v|² / s²) and s² = mean |v|² / 20. The iteration ends when the
-    slope changes by less than sqrt(1e-9), as in Gwyddion 2.62. (Gwyddion 2.45 uses the limit sqrt(1e-8),
-    which changes the result by 2e-3 of the height range.)
+    The function ``prevailing_slope`` finds the tilt iteratively from the slopes v of all 2 x 2 cells whose
+    four pixels are selected. The weights are exp(-|v|² / s²) with s² = mean |v|² / 20. The iteration ends
+    when the slope changes by less than sqrt(1e-9), as in Gwyddion 2.62. (Gwyddion 2.45 uses the limit
+    sqrt(1e-8), which changes the result by 2e-3 of the height range.)
 
     Args:
         z: heights in µm, shape (ny, nx). Slopes are computed as height / length, so heights and pitch must
@@ -65,9 +65,9 @@ def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: 
     """Return the slope of the prevailing facet, given the slopes v of n cells in d directions. ``slopes`` has
     shape (d, n), and the result has shape (d,).
 
-    In each pass, the mean of v with the weights exp(-|v|² / s²) is subtracted from v, where s² = sharpness ·
-    mean |v|². The passes end when the squared length of this mean is below ``settled2``, or after ``passes``
-    passes. The result is the sum of the subtracted means.
+    Each pass computes the mean of v with the weights exp(-|v|² / s²), where s² = sharpness · mean |v|², and
+    subtracts this mean from v. The passes end when the squared length of this mean is below ``settled2``, or
+    after ``passes`` passes. The result is the sum of the subtracted means.
     """
     total = np.zeros(len(slopes))
     for _ in range(passes):

@@ -126,11 +126,10 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
     """Fit the heights by weighted least squares, and return the coefficients c[q, p] of the products P_q(y)
     P_p(x) of Legendre polynomials.
 
-    Column j has the coordinate x = 2 j / (nx - 1) - 1, from -1 to 1; rows have y coordinates defined in the
-    same way. If a set of terms contains, for each of its terms, all terms of lower degrees, then products of
-    Legendre polynomials span the same polynomials as products of powers, but the fit is far better
-    conditioned. The sums over the pixels separate into x and y, so the fit costs only a few products of thin
-    matrices.
+    Column j has the coordinate x = 2 j / (nx - 1) - 1, which runs from -1 to 1. The y coordinates of rows are
+    defined in the same way. Legendre polynomials make the fit far better conditioned than powers. Both span
+    the same polynomials if, for each term in ``terms``, all terms of lower degrees are included as well. The
+    sums over the pixels separate into x and y, so the fit costs only a few products of thin matrices.
 
     Args:
         z: heights, shape (ny, nx); NaN only where the weight is zero.
@@ -166,9 +165,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
 
 
 def evaluate(coefficients: Array, shape: Shape) -> Array:
-    """Evaluate the surface that is given by coefficients as returned by ``fit_terms``, on a grid of the given
-    shape.
-    """
+    """Evaluate a surface on a grid of the given shape. The coefficients are as returned by ``fit_terms``."""
     basis_y, basis_x = (_basis(n, k - 1) for n, k in zip(shape, coefficients.shape, strict=True))
     return basis_y @ coefficients @ basis_x.T
 

@@ -84,8 +84,8 @@ class Recipe(BaseModel):
         mask: Array | None = None,
         layout_level: Array | None = None,
     ) -> Levelled:
-        """Level a scan. In the result, ``height + removed`` is the input, and both are NaN where nothing was
-        measured.
+        """Level a scan. In the result, ``height + removed`` is the input. Both ``height`` and ``removed`` are
+        NaN where nothing was measured.
 
         Args:
             scan: a ``Scan``, whose pitch and mask are used, or an array of heights in µm, shape (ny, nx).
@@ -95,7 +95,8 @@ class Recipe(BaseModel):
                 layout. Only ``layout-aware`` steps need it.
 
         Raises:
-            InputError: a step needs a pitch or layout that is not given, or cannot be applied to the data.
+            InputError: a step needs a pitch or a layout that is not given, or a step cannot be applied to the
+                data.
         """
         if isinstance(scan, Scan):
             heights, mask, pitch_um = scan.height_um, scan.mask if mask is None else mask, scan.pitch_um

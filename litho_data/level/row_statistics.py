@@ -42,8 +42,8 @@ def row_modus(values: Array, chosen: Array) -> Array:
 
     If heights have few digits, several windows often have the same length, and rounding errors would decide
     which is the shortest. Gwyddion compares the lengths in metres. This function therefore converts the
-    values to metres and rounds them to 12 digits, so that it chooses the same window as Gwyddion, whatever
-    the unit of the file.
+    values to metres and rounds them to 12 digits, so that it chooses the same window as Gwyddion for every
+    unit of the file.
     """
     return np.array([_modus(np.sort(row[use])) for row, use in zip(values, chosen, strict=True)])
 

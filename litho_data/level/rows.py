@@ -49,10 +49,10 @@ def align_rows(
     of an error of the scan.
 
     Args:
-        z: heights in µm, shape (ny, nx). The methods ``"matching"`` and ``"modus"`` require this unit,
-            because they convert heights to metres to give the same result as Gwyddion. Their results depend
-            on the unit, because the weights of ``"matching"`` compare a squared height with a height, and
-            because in ``"modus"`` rounding errors decide between windows of equal length.
+        z: heights in µm, shape (ny, nx). The results of the methods ``"matching"`` and ``"modus"`` depend on
+            the unit. These methods therefore convert the heights from µm to metres, the unit that Gwyddion
+            uses. In ``"matching"``, the weights compare a squared height with a height. In ``"modus"``,
+            rounding errors decide between windows of equal length.
         method: ``median``, ``trimmed-mean`` and ``modus`` shift each row so that the median, trimmed mean or
             modus is the same for all rows. The two ``-of-differences`` methods and ``matching`` estimate the
             step between each pair of neighbouring rows and add up these steps, which preserves large
@@ -97,8 +97,8 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """Return a warning if an alignment shifted lines that seem to have had no offset, otherwise an empty
-    string.
+    """Return a warning if an alignment shifted lines that seem to have had no offset. Otherwise return an
+    empty string.
 
     A real offset shifts all pixels of a line. The alignment is suspect if it shifted a line relative to a
     neighbouring line by far more than the noise, although many pixels of the two lines had about the same
@@ -121,8 +121,8 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
-    """Replace the shift of each row that has fewer than ``fewest`` selected pixels by the upper median of all
-    selected heights. Then subtract the mean shift from all shifts, and return them.
+    """If a row has fewer than ``fewest`` selected pixels, replace its shift by the upper median of all
+    selected heights. Return all shifts minus their mean.
     """
     values = np.sort(z[chosen])
     shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
@@ -140,8 +140,8 @@ def _difference_shifts(z: Array, chosen: Array, trim: float) -> Array:
 
 
 def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array:
-    """Return the shifts of the rows by Gwyddion's method of matching: cumulative sums of the steps between
-    neighbouring rows, where each step is a weighted mean over the pixels.
+    """Return the shifts of the rows by Gwyddion's method Matching. The step between two neighbouring rows is
+    a weighted mean over the pixels, and the shifts are the cumulative sums of the steps, minus their mean.
 
     Args:
         last_column_counts: whether the last column is used even where it is not selected. Gwyddion does so if

@@ -32,12 +32,12 @@ def mark_scars(
     """Mark scars, which are streaks along the rows that are higher or lower than the rows above and below
     them.
 
-    A streak may be up to ``max_width_px`` rows wide. In each column, the prominence of a streak is the height
-    of its lowest pixel minus the height of the higher one of the two pixels that adjoin the streak in this
-    column. Negative streaks are found in the same way after the sign of the heights is reversed. The
-    prominence is stated in units of the rms difference between rows, sqrt(sum of squared differences between
-    neighbouring rows / number of pixels). A run of at least ``min_length_px`` pixels along a row is a scar if
-    its prominence reaches ``high`` somewhere and never falls below ``low``.
+    A streak may be up to ``max_width_px`` rows wide. The prominence of a streak is computed in each column.
+    It is the lowest height of the streak minus the height of the pixel directly above or below the streak,
+    whichever is higher. Negative streaks are found in the same way after the sign of the heights is reversed.
+    The prominence is stated in units of the rms difference between rows, sqrt(sum of squared differences
+    between neighbouring rows / number of pixels). A run of at least ``min_length_px`` pixels along a row is a
+    scar if its prominence reaches ``high`` somewhere and never falls below ``low``.
 
     Returns:
         A bool array of shape (ny, nx). Only selected pixels are marked.
@@ -92,7 +92,7 @@ def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
 def _prominence(z: Array, max_width_px: int) -> Array:
     """Return, for each pixel, the largest prominence of the ridges that contain it and are at most
     ``max_width_px`` rows wide. In each column, the prominence of a ridge is its lowest height minus the
-    higher of the two pixels above and below it.
+    height of the pixel directly above or below the ridge, whichever is higher.
     """
     ny = z.shape[0]
     prominence = np.zeros_like(z)
@@ -118,8 +118,8 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Return values for the unknown pixels that satisfy Laplace's equation, in the order of ``z[unknown]``.
-    Unmeasured pixels (NaN) are also filled in this solution, but their values are not returned.
+    """Solve Laplace's equation at the unknown pixels, and return their values in the order of ``z[unknown]``.
+    The solution also fills unmeasured pixels (NaN), but their values are not returned.
     """
     from SurfaceTopography import Topography
 

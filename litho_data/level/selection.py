@@ -13,8 +13,8 @@ class Levelled(NamedTuple):
     """A levelled height map and the surface that levelling removed; ``height + removed`` is the input.
 
     Both maps are float64 arrays of shape (ny, nx) in the unit of the input. Pixels that are NaN in the input
-    are NaN in ``height``. ``removed`` has no NaN. If it is constant along an axis, it may be a read-only
-    view.
+    are NaN in ``height``. ``removed`` of a single operation has no NaN. It may be a read-only view if it is
+    constant along an axis. ``removed`` of a recipe is NaN where ``height`` is NaN.
     """
 
     height: Array
