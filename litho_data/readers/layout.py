@@ -64,7 +64,7 @@ def read_layout(
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:
-    """Count the light pixels in each square with sides of ``side`` pixels, in an image with two grey values."""
+    """Count the light pixels in each square of side ``side``, in px, of an image with two grey values."""
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:
