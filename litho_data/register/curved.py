@@ -43,9 +43,9 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
     Return None if the fit fails, or if creep was fitted and the held-out blocks do not confirm it.
 
     Creep displaces the image, along x and along y, by polynomials of degree 6 in the coordinate along the
-    slow axis. The two polynomials add ten coefficients to those of the affine map. Creep is accepted only if
-    it predicts held-out blocks better than the straight warp does. For this test, the field is divided into
-    squares with sides of 64 px. The squares form two halves, like the black and the white squares of a
+    slow axis. The two polynomials add ten coefficients to the six of the affine map. Creep is accepted only
+    if it predicts held-out blocks better than the straight warp does. For this test, the field is divided
+    into squares with sides of 64 px. The squares form two halves, like the black and the white squares of a
     chequerboard. The warps with and without creep are fitted to each half, and each fit predicts the other
     half.
 

@@ -140,7 +140,7 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
     """Return a copy of the scan with NaN at the defects.
 
     ``scan`` has shape (ny, nx), and ``defects`` is a bool mask on the layout's pixels. ``layout_to_scan`` is
-    the 3×3 matrix from pixel indices of the layout to those of the scan.
+    the 3×3 matrix from pixel indices of the layout to pixel indices of the scan.
     """
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape

@@ -41,7 +41,8 @@ def orient(image: Array, orientation: str) -> Array:
 
 
 def orientation_matrix(orientation: str, shape: Shape) -> Array:
-    """Return the matrix that maps pixel indices of an image to those of ``orient(image, orientation)``.
+    """Return the matrix that maps pixel indices of an image to pixel indices of ``orient(image,
+    orientation)``.
 
     ``shape`` is the shape (ny, nx) of the image.
     """

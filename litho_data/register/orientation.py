@@ -20,8 +20,8 @@ TIE = 0.02
 class Hypothesis:
     """One possible orientation and polarity of the scan, with the shift at which it correlates best.
 
-    ``layout_to_oriented`` is the 3×3 matrix of this shift, from pixel indices of the layout to those of the
-    oriented scan. ``ncc`` is the correlation at this shift, multiplied by the polarity.
+    ``layout_to_oriented`` is the 3×3 matrix of this shift, from pixel indices of the layout to pixel indices
+    of the oriented scan. ``ncc`` is the correlation at this shift, multiplied by the polarity.
     """
 
     orientation: str

@@ -49,7 +49,7 @@ def refine_pyramid(
         scan: oriented heights at the layout's pitch, with the bow removed, shape (ny, nx), NaN where not
             measured.
         layout_level: integer levels, shape (ny, nx).
-        start: the coarse warp, a 3×3 matrix from pixel indices of the layout to those of the scan.
+        start: the coarse warp, a 3×3 matrix from pixel indices of the layout to pixel indices of the scan.
         model: the kind of warp. At reduced resolution, an affine map is fitted in place of a homography.
         tolerance_px: tolerance of the refinement at full resolution.
 

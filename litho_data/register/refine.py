@@ -87,9 +87,9 @@ def refine(
     Args:
         scan: smoothed heights, shape (ny, nx), NaN where not measured.
         topography: topography predicted from the layout, shape (ny, nx).
-        start: the warp at which the search starts, a 3×3 matrix from pixel indices of the layout to those of
-            the scan. It must be of the kind ``model``. Its position error may be as large as the width of
-            the printed structures.
+        start: the warp at which the search starts, a 3×3 matrix from pixel indices of the layout to pixel
+            indices of the scan. It must be of the kind ``model``. Its position error may be as large as the
+            width of the printed structures.
         model: the kind of warp.
         bend: bend of the scan. If a bend is given, ``start`` must be an affine map, and warp and bend are
             evaluated but not refined.
