@@ -58,7 +58,7 @@ def level_layout_aware(
         layout_level: level of the layout under each pixel of the scan, shape (ny, nx), NaN outside the
             layout; see ``layout_in_scan_frame``.
         blur_px: sigma, in pixels, of the Gaussian that blurs the layout as printing does. By default, a few
-            values are tried, and the one with the best fit is used. Pixels within two sigma of the layout's
+            values are tried, and the value with the best fit is used. Pixels within two sigma of the layout's
             edge are not fitted, because their height depends on what surrounds the layout.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 

@@ -167,8 +167,8 @@ def array_channel(name: str, held: Held) -> Channel:
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
     """Return the names of the dimensions along y and x, and True if the array's first index runs along x.
 
-    If neither dimension has coordinates, the function returns the names of two coordinates with names like x
-    and y. It does so only if their lengths match the shape of the array.
+    If neither dimension has coordinates, the function looks for two coordinates named like x and y, such as
+    "lon" and "lat". It returns their names if their lengths match the shape of the array.
     """
     known = held.coordinates
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)

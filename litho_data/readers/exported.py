@@ -26,7 +26,7 @@ def export_of(file: Path) -> dict[str, Any]:
     empty if the file has no such sidecar.
 
     Raises:
-        InputError: the SHA-256 of the file differs from the one that the sidecar states.
+        InputError: the SHA-256 of the file differs from the SHA-256 that the sidecar states.
     """
     says = _said(path := _beside(file))
     if says and says.get("file_sha256") != file_sha256(file):
