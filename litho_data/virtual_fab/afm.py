@@ -26,8 +26,8 @@ def scan_surface(
     """Return the heights, in µm, that the microscope reports for a surface.
 
     The fast axis is x, and the top line is scanned first. Lines run from left to right in trace, and from
-    right to left in retrace. If the pixels are smaller, the tip moves more slowly, so the same time lag of
-    the feedback shifts the heights by a shorter distance.
+    right to left in retrace. The tip spends the same time on every pixel, whatever its size. In a scan with
+    smaller pixels, the time lag of the feedback therefore shifts the heights by a shorter distance.
 
     Args:
         surface_um: true heights at the pixels of the scan, in µm.
@@ -139,8 +139,8 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Return a copy of the heights to which scars along the fast axis and spikes of a single pixel are added.
-    Each scar and each spike has a random sign.
+    """Add scars along the fast axis and spikes of a single pixel to a copy of the heights, and return the
+    copy. Each scar and each spike has a random sign.
     """
     scarred = height.copy()
     ny, nx = height.shape

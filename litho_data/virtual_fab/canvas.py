@@ -1,5 +1,5 @@
-"""Define the canvas, which is the simulated area of a layout and its surroundings. The module also computes
-blurs on the canvas, by multiplying spectra.
+"""Define the canvas, which is the area that is simulated: a layout and a guard frame around it. The module
+also computes blurs on the canvas, as products of spectra.
 """
 
 from dataclasses import dataclass
@@ -63,12 +63,13 @@ def frame_layout(level: Array) -> Array:
 
 
 def cut_layout(array: Array) -> Array:
-    """Return the part of an array on the canvas that lies inside the layout."""
+    """Cut an array on the canvas to the area of the layout, and return this part."""
     return array[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX]
 
 
 def set_layout(array: Array, inner: Array) -> Array:
-    """Return a copy of an array on the canvas in which ``inner`` replaces the values inside the layout."""
+    """Return a copy of an array on the canvas. In the copy, ``inner`` replaces the values inside the layout.
+    """
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed

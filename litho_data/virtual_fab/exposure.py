@@ -87,15 +87,15 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Return the nominal dose if every point x of a hatch line is written at x + strength·x(1 − x/L) instead
-    of x.
+    """Return the nominal dose of hatch lines that are written with errors of position. What belongs at x is
+    written at x + strength·x(1 − x/L).
 
     The coordinate x runs from 0 to L, where L is the side of the write field.
     """
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # The point x that is written at ``at`` solves the equation x + strength·x(1 − x/L) = at. Of the
-    # equation's two roots, x is the one that is 0 for at = 0.
+    # The equation x + strength·x(1 − x/L) = at has two roots. The point that is written at ``at`` is the root
+    # that is 0 for at = 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
@@ -119,8 +119,8 @@ def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -
 
     Args:
         nominal: nominal dose on the canvas.
-        starts: the first rows of the fields along y, and the first columns of the fields along x, in pixels
-            of the canvas.
+        starts: two lists: the first row of every field along y, and the first column of every field along x,
+            in pixels of the canvas.
         offset_px: displacements (y, x) of the fields in pixels, shape (fields along y, fields along x, 2).
             The dose of a displaced pixel is divided among the four pixels that it covers.
     """
@@ -166,8 +166,8 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Return the effective dose for a resist in which the doses of different slices do not add up. Each slice
-    is then exposed only where its own dose exceeds a threshold.
+    """Return the effective dose of a resist that responds to every slice separately, and not to the sum of
+    all doses. A slice is exposed only where its own dose exceeds a threshold.
     """
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)

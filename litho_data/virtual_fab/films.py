@@ -26,9 +26,8 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# First value: factor by which the pixels of the micrograph, and of the image in which edges are located, are
-# smaller than the pixels of the layout. Second value: number of pixels by which the image with the edges is
-# padded.
+# First value: number of pixels along the side of a layout pixel, in the micrograph and in the image in which
+# edges are located. Second value: number of pixels by which the image with the edges is padded.
 _FINER, _AROUND = 4, 64
 # Width, in px, of the rim without film around a random layout.
 _RIM_PX = 12
@@ -231,8 +230,8 @@ def simulate_films(
         knobs: the effects that are added to the plain process.
 
     Raises:
-        InputError: the process is unknown or has no lens to defocus, or the folder contains a run with other
-            settings or other files.
+        InputError: the process is unknown, a defocus is set for the process ``e-beam``, or the folder
+            contains other files or a run with other settings.
     """
     import cv2
 
@@ -250,7 +249,8 @@ def simulate_films(
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden):
             part.mkdir(parents=True)
-        # Bare ground is added around each field, so that its periodic copies are too far away to affect it.
+        # Bare ground is added around each field, so that the field is too far away from its periodic copies
+        # to be affected by them.
         longest_um = max(8 * printer.resolved_um, 3 * knobs.backscatter_um * (knobs.backscatter > 0))
         bare_px = math.ceil(longest_um / 2 / printer.pitch_um)
         inner = (slice(_FINER * bare_px, -_FINER * bare_px),) * 2

@@ -125,11 +125,10 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """Make the jobs that print and scan the layouts of a dataset card, in the way that the card's table
-    states.
+    """Make the jobs that print and scan the layouts of a dataset card.
 
-    The table may state for each scan how it was made, in the columns ``turned_deg``, ``direction``, ``tip``
-    and ``pixel_size``. Rows with the same print and the same layout are then scans of one printed field.
+    The columns ``turned_deg``, ``direction``, ``tip`` and ``pixel_size`` of the card's table may state how
+    each scan is made. Rows with the same print and the same layout are then scans of one printed field.
 
     Args:
         path: path of the card.

@@ -28,14 +28,15 @@ class Knob:
         name: name of the knob on the command line and in the truth file.
         effect: name of the effect in the catalogue of effects, or `off-catalogue` if it is not listed there.
         stage: the stage of printing or scanning at which the effect acts.
-        role: what causes the effect: the process, the measurement, or chance (``nuisance``). ``undetermined``
-            means that it is either the process or the measurement, but not known which.
+        role: the origin of the effect: the process or the measurement. ``nuisance`` marks an effect that no
+            process model can predict. ``undetermined`` means that the origin is not known.
         unit: unit of the strength.
         limit: largest strength that is accepted.
         meaning: text that says what the strength means, and which properties are drawn at random.
-        nuisance_span: True if the offset, gain, plane and bow fitted to each scan absorb nearly all of the
+        nuisance_span: True if a fit of offset, gain, plane and bow to each scan absorbs nearly all of the
             effect.
-        refit_absorbs: True if other parameters of the plain model of printing can imitate most of the effect.
+        refit_absorbs: True if the plain model of printing imitates most of the effect when its parameters are
+            fitted again.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class KnobSetting:
-    """A knob set to a strength. If ``seed`` is None, its random draws use the seed of the run."""
+    """A knob and its strength. If ``seed`` is None, the knob's random draws use the seed of the run."""
 
     name: str
     strength: float
@@ -100,9 +101,7 @@ def checked(setting: KnobSetting) -> KnobSetting:
 
 
 class KnobBoard:
-    """The knobs of one run. The board holds their strengths, and a separate stream of random numbers for each
-    knob.
-    """
+    """The knobs of one run. Each knob has a strength and its own stream of random numbers."""
 
     def __init__(self, settings: Iterable[KnobSetting], run_seed: int):
         self.settings = tuple(checked(setting) for setting in settings)

@@ -34,8 +34,8 @@ class Job:
         use: purpose of the scan. If it is ``substrate`` (a bare substrate) or ``grating`` (a calibration
             standard), nothing is printed.
         grating_um: period of the grating in µm.
-        print_index: number of the print in its set. It is given if a print is scanned more than once. With
-            None, the number of the print is ``index``.
+        print_index: number of the print in its set, for a print that is scanned more than once. With None, it
+            is equal to ``index``.
         turned_deg: rotation of the print under the microscope in degrees, a multiple of 90.
         direction: direction of the scan lines, 1 for trace and -1 for retrace.
         tip: number of the tip. Tip 1 is as blunt as the knobs state; every later tip is new and sharp.
@@ -60,7 +60,7 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Return the number of the print. The random draws for the print depend on this number; the random
+        """Return the number of the print. The random draws for the print depend on this number. The random
         draws for the scan depend on ``index``.
         """
         return self.index if self.print_index is None else self.print_index

@@ -13,7 +13,7 @@ _NARROW_UM = 1.5
 
 
 def develop(dose: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the heights of the developed and dried print on the canvas, in µm above the height zero of the
+    """Return the heights of the developed and dried print on the canvas, in µm above the zero height of the
     scans.
 
     The conversion of a column of resist is a logistic function of its dose. When the print dries, a column in
@@ -72,7 +72,7 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
 
 
 def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the heights after the shrinkage that the knobs cause in addition to the shrinkage by drying."""
+    """Apply the shrinkage that the knobs add to the shrinkage by drying, and return the heights."""
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
     if strength := knobs["dose-dependent-shrinkage"]:
@@ -89,8 +89,8 @@ def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, 
 
 
 def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Return the heights after the effects of capillary forces and of the developer on narrow features and
-    steep flanks.
+    """Change narrow features and steep flanks as capillary forces and the developer do, and return the
+    heights.
     """
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:

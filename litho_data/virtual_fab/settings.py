@@ -1,5 +1,5 @@
-"""Define the settings of the virtual fab's printer, microscope and default noise, and presets, which are
-named settings for whole runs. Knobs are defined in ``virtual_fab.knobs``.
+"""Define the settings of the virtual fab's printer, microscope and default noise. A preset is a named set of
+settings for a whole run. Knobs are defined in ``virtual_fab.knobs``.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class Printer:
         threshold_dose: dose at which the conversion of the resist rises fastest, as a share of the full dose.
         threshold_steepness: steepness of the logistic curve of conversion against dose. The dose is in units
             of the full dose.
-        network_reach_um: standard deviation of the Gaussian neighbourhood whose mean conversion determines
-            how much a column shrinks.
+        network_reach_um: standard deviation of the Gaussian with which the conversion around a column is
+            averaged. This mean determines how much the column shrinks.
         loose_retention: share of its height that a column keeps if no resist around it is converted. If all
             resist around it is converted, a column keeps its whole height.
-        base_um: height of the base layer's surface above the zero of the scans.
+        base_um: height of the base layer's surface above the zero height of the scans.
         stitch_field_um: side of the write fields into which a larger layout is divided. The knob
             ``stitching`` displaces these fields.
     """
@@ -83,7 +83,7 @@ class Microscope:
 
 @dataclass(frozen=True)
 class Noise:
-    """The standard deviations of the default noise, in nm.
+    """The standard deviations, in nm, of the default noise, which is added without any knob.
 
     On a flat print, the standard deviation of the total noise is the root of the sum of the squares of
     ``roughness_nm``, ``line_nm`` and ``pixel_nm``. On a bare substrate, ``substrate_nm`` takes the place of

@@ -74,12 +74,12 @@ def simulate(
             then ignored.
         name: name of the dataset, which is written to the card.
         plan_of: hash of the dataset with which the layouts were planned. It is written to the card.
-        print_pattern: regular expression that finds the print of a scan in the scan's id, which is written to
-            the card.
+        print_pattern: regular expression that finds the name of the print in the id of a scan. It is written
+            to the card.
 
     Raises:
         InputError: a knob is unknown or its strength is out of range, the layouts cannot be printed, or the
-            folder contains a run with other settings or other files.
+            folder contains other files or a run with other settings.
     """
     if references and jobs is not None:
         raise InputError(
@@ -159,8 +159,8 @@ def simulate(
 
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
-    """Write the file of one scan in the format that the microscope's settings name. An id may contain dots,
-    so the suffix is appended to the whole id.
+    """Write the file of one scan in the format ``microscope.files``. The suffix is appended to the whole id,
+    because an id may contain dots.
     """
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
@@ -210,8 +210,8 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]], sizes_um: list[YX]) -> None:
-    """Write the card's table. The columns in SCANNING are written only if at least one scan differs from a
-    usual scan in them, and the sizes (y, x) of the scans only if they are not all the same.
+    """Write the card's table. The columns SCANNING are left out if all scans have the usual values in them.
+    The sizes (y, x) of the scans are left out if all scans have the same size.
     """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
@@ -246,11 +246,11 @@ def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: i
         plan: folder with ``card.toml``, layouts and ``scans.csv``, as ``litho-models next-print`` writes it.
         fab: folder of the earlier run, which contains ``truth``.
         out: folder of the new run, in which ``raw`` and ``truth`` are written.
-        seed: seed of the new random draws. It must differ from that of the earlier run.
+        seed: seed of the new random draws. It must differ from the seed of the earlier run.
 
     Raises:
-        InputError: the plan or the truth is missing, the seed is that of the earlier run, or the printer
-            cannot print the layouts.
+        InputError: the plan or the truth is missing, the seed is equal to the seed of the earlier run, or the
+            printer cannot print the layouts.
     """
     card = Path(plan) / CARD_NAME
     truth = Truth.read(Path(fab) / "truth")

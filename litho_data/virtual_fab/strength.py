@@ -42,8 +42,8 @@ def strength_for_rms(
 ) -> KnobStrength:
     """Find the strength at which a knob changes noise-free scans by ``rms_nm``.
 
-    The change is computed by ``knob_rms_nm``. It grows with the strength, so an interval search within the
-    range of the knob finds the strength.
+    ``knob_rms_nm`` computes the change. The change grows with the strength, so the strength is found by an
+    interval search within the range of the knob.
 
     Args:
         name: name of the knob.
@@ -53,8 +53,8 @@ def strength_for_rms(
         seed: seed of the knob.
 
     Raises:
-        InputError: the knob is unknown, ``rms_nm`` is not positive, or the offset, gain, plane and bow fitted
-            to each scan absorb the effect completely.
+        InputError: the knob is unknown, ``rms_nm`` is not positive, or a fit of offset, gain, plane and bow
+            to each scan absorbs the effect completely.
     """
     if not rms_nm > 0:
         raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
@@ -119,8 +119,8 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
     The per-scan terms are offset, gain, plane and bow: {1, P, x, y, x², xy, y²}, where P is the scan without
     the knob. They are fitted to the change of each scan by least squares and subtracted. The pixels of the
-    scans coincide with those of the layout. A knob that displaces the scan is therefore measured by the
-    height changes that the displacement causes at these pixels.
+    scans coincide with those of the layout. For a knob that displaces the scan, the change is therefore the
+    difference of the heights at the same pixel.
     """
     mean_squares = []
     for job in jobs:

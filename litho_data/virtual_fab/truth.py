@@ -93,8 +93,8 @@ def noise_floor(noise_um: Array) -> dict[str, float]:
     """Return the offset of the noise in one scan, and the mean absolute value and the root mean square of the
     noise, in nm.
 
-    Values whose names begin with ``floor_full`` are computed after offset, tilt and bow have been removed.
-    For the other values whose names begin with ``floor``, only the offset has been removed.
+    For the values ``floor_full_mae_nm`` and ``floor_full_rmse_nm``, offset, tilt and bow are removed from the
+    noise. For ``floor_mae_nm`` and ``floor_rmse_nm``, only the offset is removed.
     """
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
