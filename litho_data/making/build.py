@@ -62,16 +62,15 @@ def build_dataset(
         workers: number of local processes.
         dask: address of a Dask scheduler, which is used in place of local processes. The store is the same
             either way.
-        strict: if true, nothing is built if any scan has to be skipped, or if a scan has no layout or a
-            layout has no scan.
+        strict: if true, nothing is built unless every id has a scan and a layout that can be used.
         seed: seed of the robust estimator in the registration.
         tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans. It replaces the
-            value in the card. Pixels that the tip may not have touched become invalid.
+            value in the card. Pixels that the tip possibly did not touch become invalid.
 
     Raises:
-        InputError: the card is bad; no scan is usable; ``strict`` is true, and a scan has to be skipped or an
-            id lacks its scan or its layout; ``tip`` is neither a radius nor ``blind``; or ``out`` contains
-            something other than a store.
+        InputError: the card is bad, no scan is usable, ``tip`` is neither a radius nor ``blind``, or ``out``
+            contains something other than a store. If ``strict`` is true, the error is also raised if an id
+            has no usable scan or no usable layout.
     """
     listing = list_fields(card_path, data_dir)
     if tip is not None:
@@ -137,8 +136,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
-            # A scan with bad input raises no error here, so this error comes from the workers, for example
-            # from a Dask cluster. Scans that are finished are kept for the next run.
+            # A scan with bad input raises no error here. This error therefore comes from the workers, for
+            # example from a Dask cluster. Finished scans are kept for the next run.
             if not records:
                 partial.discard()
             raise
@@ -206,10 +205,10 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """For every scan that could not be registered, find out whether it shows a layout of another id.
+    """Find out whether the scans that could not be registered show the layout of another id.
 
-    If it does, the id of that layout is added to the scan's reason in ``skipped``. The result maps the id of
-    each of these scans to a message that names the layout.
+    If a scan does, the id of this layout is added to the reason in ``skipped``. The result maps the ids of
+    these scans to messages that name the layout.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
@@ -234,9 +233,9 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], jobs: Sequence[Job]) -> dict[str, str]:
-    """Find the scans whose pixels have another aspect ratio than the pixels of most scans. The result maps
-    the ids of these scans to the reason for leaving them out. Reference scans, and scans whose size is stated
-    by their own file or by the card's table, are not compared.
+    """Find the scans whose pixels differ in aspect ratio from the pixels of most scans. The result maps the
+    ids of these scans to the reason for leaving them out. Reference scans, and scans whose size is stated by
+    their own file or by the card's table, are not compared.
 
     A text file that lacks its last rows can still be read as a matrix. Its pixels then seem too long along y,
     because the side length that the card states for all scans is divided by too few rows.

@@ -113,11 +113,12 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def defaults_beside(own: Collection[str]) -> list[str]:
-    """Return the arguments of ``read_scan``, out of ``unit`` and ``size_um``, whose values are used only if
-    the file of a scan states none. These are the values that the card states for all scans.
+    """Return which of the arguments ``unit`` and ``size_um`` of ``read_scan`` are mere defaults, so that a
+    value in the file of a scan takes precedence. An argument is a mere default if the card states it for all
+    scans together.
 
-    ``own`` contains the names of the values that the card or its table states for one scan alone. The file of
-    this scan must agree with these values, so they are not returned.
+    ``own`` contains the names of the values that the card or its table states for one scan alone. They are
+    not returned, because the file of this scan must agree with them.
     """
     return [name for name in ("unit", "size_um") if name not in own]
 

@@ -47,7 +47,7 @@ class Chain:
 
     @property
     def scales(self) -> Facts:
-        """Return the calibrated scales of the microscope, or an empty mapping without calibration
+        """Return the calibrated scales of the microscope. The mapping is empty if there are no calibration
         standards.
         """
         return self.facts.get("calibrate", {})

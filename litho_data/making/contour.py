@@ -16,10 +16,10 @@ from litho_data.foundation import Array, InputError
 REACH_PX = 8.0
 """Distances from an edge are measured at least up to this many pixels of the micrograph."""
 _NOISE_PX = 1.0
-# Before the final edge, a first edge is found with a single threshold for the whole picture. Pixels on the
-# film whose distance from the first edge lies in the first range, in px, count as rim. Pixels off the film
-# whose distance lies in the second range count as ground. The last value is the sigma, in px, of the Gaussian
-# with which the brightness of rim and ground is averaged.
+# A first edge is found with a single threshold for the whole picture, before the final edge is located.
+# Pixels on the film whose distance from the first edge lies in the first range, in px, count as rim. Pixels
+# off the film whose distance lies in the second range count as ground. The last value is the sigma, in px, of
+# the Gaussian with which the brightness of rim and ground is averaged.
 _RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
 # Largest distance, in px, of the final edge from the first edge.
 _NEAR_PX = 5
@@ -36,8 +36,8 @@ class Edges(NamedTuple):
 
     ``distance_px`` has the shape (ny, nx) of the micrograph. It contains the signed distance of each pixel
     from the nearest edge, positive on the film. ``specks`` is a bool mask of the same shape. It marks dots
-    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation with which a
-    single pixel determines the position of an edge.
+    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of an edge
+    position that is determined from a single pixel.
     """
 
     distance_px: Array
@@ -50,7 +50,7 @@ def find_edges(grey: Array, reach_px: float = REACH_PX) -> Edges:
 
     Args:
         grey: grey values of the micrograph, shape (ny, nx).
-        reach_px: larger distances from an edge are set to this value.
+        reach_px: largest distance that is measured. Pixels farther from an edge get this distance.
 
     Raises:
         InputError: the micrograph shows no edges.
@@ -62,8 +62,8 @@ def find_edges(grey: Array, reach_px: float = REACH_PX) -> Edges:
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     smooth = gaussian_filter(np.asarray(grey, dtype=float), _NOISE_PX)
-    # The threshold is found from logarithms of the brightness, so that bright rims and charging affect it
-    # less.
+    # The threshold is found from the logarithm of the brightness, because bright rims and charging affect the
+    # logarithm less.
     logarithm = np.log(smooth + _DARKEST)
     first = logarithm > threshold_otsu(logarithm)
     film = remove_small_holes(remove_small_objects(first, max_size=_SPECK_PX), max_size=_SPECK_PX)

@@ -13,12 +13,12 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs. If ``tip = "blind"`` in their card, estimate the radius of the tip, and put it in
-    place of "blind".
+    """Estimate the radius of the tip if the card of the jobs states ``tip = "blind"``. Return the jobs with
+    this radius in place of "blind". All other jobs are returned unchanged.
 
-    If the scans set no limit on the radius, the jobs are returned without a tip. The estimate is also printed
-    on stderr. Scans that cannot be read are not used for the estimate. The build reports later why they
-    cannot be read.
+    If the scans set no upper limit on the radius, the returned jobs have no tip radius. The estimate is also
+    printed on stderr. Scans that cannot be read are not used for the estimate. The build reports later why
+    they cannot be read.
     """
     if not jobs or jobs[0].card.process.tip != "blind":
         return list(jobs)

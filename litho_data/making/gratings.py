@@ -13,8 +13,8 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """The values that were measured in one scan of a grating. A value that could not be measured is None.
-    ``problem`` gives the reason, if there is one.
+    """The values that were measured in one scan of a grating. A value that could not be measured is None. If
+    the grating could not be evaluated, ``problem`` gives the reason.
 
     Args:
         period_um: known period of the grating.

@@ -34,8 +34,7 @@ def height_sigma(
       resampling;
     - ``resampling``: the fine structure of the print that interpolation loses;
     - ``registration``: the uncertainty of the warp, multiplied by the slope of the heights;
-    - ``levelling``: the tilt and bow that levelling failed to remove, or removed although they belong to the
-      print;
+    - ``levelling``: the tilt and bow that levelling left in the heights, or wrongly removed from the print;
     - ``calibration``: the uncertainty of the z scale, multiplied by the height above the scan's mean.
 
     Args:
@@ -44,19 +43,18 @@ def height_sigma(
         layout_level: levels of the layout on the same grid.
         scan_pitch_um: pitch (y, x) of the scan in µm.
         layout_pitch_um: pitch of the layout in µm.
-        blur_px, model: sigma of the blur, in layout pixels, and kind of warp that the registration found, as
-            in ``warp_error``.
+        blur_px, model: results of the registration: the sigma of the blur, in layout pixels, and the kind of
+            warp, as in ``warp_error``.
         levelled: whether a levelling recipe was applied. If so, the part ``levelling`` includes an estimate
-            of the surface that the recipe removed from the print. If no recipe was applied, the part
-            ``levelling`` is the quadratic surface that does not belong to the print, provided that this
-            surface is significant.
+            of the surface that the recipe wrongly removed from the print. If not, this part is only the
+            quadratic surface that does not belong to the print, and 0 if this surface is not significant.
         fast_axis: the axis along which the tip moved fast.
         z_uncertainty: relative uncertainty of the z scale; 0 if the z scale was not calibrated.
 
     Returns:
         The uncertainty in µm as float32 on the layout's grid, NaN where not valid; and a mapping with root
-        mean squares over the scan, in nm. Its key is ``sigma_<part>_nm`` for each part, and ``sigma_nm`` for
-        the total uncertainty.
+        mean squares over the scan, in nm. The mapping has the key ``sigma_<part>_nm`` for each part, and the
+        key ``sigma_nm`` for the total uncertainty.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape

@@ -70,8 +70,8 @@ def finish(job: Job, unfinished: PartialStore) -> Facts | str:
 class FieldJob:
     """The job that reads, levels, registers and resamples the scan of one printed field.
 
-    ``scan_name`` and ``layout_name`` are the names of the field's files in the record, which are their paths
-    relative to the data folder.
+    ``scan_name`` and ``layout_name`` are the recorded names of the field's files, i.e. their paths relative
+    to the data folder.
     """
 
     field: PrintedField
@@ -200,9 +200,9 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """Return the parameters that describe the grid of the layout. If the surroundings of the field are
-        unknown or continue the print, ``edge_px`` states the width, in pixels, of the border whose heights
-        become invalid because they depend on these surroundings.
+        """Return the parameters that describe the grid of the layout. If the card states that the field's
+        surroundings are unknown or continue the print, the heights at the border depend on them and become
+        invalid. ``edge_px`` is then the width of this border in pixels.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)
@@ -221,8 +221,8 @@ class FieldJob:
 
     @property
     def _layout_files(self) -> dict[str, Path]:
-        """The files from which the levels are read, keyed by their recorded names: the layout file and, if
-        the design package exported the layout, the sidecar file.
+        """Return the files from which the levels are read, keyed by their recorded names. They are the layout
+        file and, for a layout that the design package exported, its sidecar file.
         """
         if self.field.layout is None or self.layout_name is None:
             return {}
@@ -277,8 +277,8 @@ def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
 
 
 def _own_reader(scan: Path, format: str) -> dict[str, str]:
-    """Return the parameter that identifies the user's own reader of a scan. There is none if a reader of this
-    package reads the scan.
+    """Return the parameter that identifies the reader of a scan if the user wrote this reader. For a reader
+    of this package, the result is empty.
     """
     sha256 = own_reader_sha256(scan, format)
     return {READER_SHA256: sha256} if sha256 else {}

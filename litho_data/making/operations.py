@@ -2,7 +2,7 @@
 parameters and inputs.
 
 A build runs these operations, and ``replay`` repeats them from the records in the store. No other code makes
-arrays of a store.
+the arrays of a store.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     covered = coverage(np.where(valid, distance, np.nan), pitch_um)
     dirt = foreign(covered, level / params["full_level"], params["dirt_px"])
     if shift_px := edge_shift_px(level, np.where(valid, distance / pitch_um, np.nan)):
-        # The edges may have moved farther than `dirt_px`, so that whole edges are marked as dirt. Only pixels
+        # If the edges moved farther than `dirt_px`, whole edges are marked as dirt. Therefore, only pixels
         # that are also marked relative to the moved edges count as dirt.
         moved = with_moved_edges(level, shift_px) / params["full_level"]
         dirt &= foreign(covered, moved, params["dirt_px"])
@@ -198,7 +198,7 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs these levels.
 
-    The levels are NaN at defects too, so that no background is fitted to dust.
+    The levels are also NaN at defects, so that no background is fitted to dust.
     """
     from litho_data.level import layout_in_scan_frame
 
@@ -257,8 +257,8 @@ def _register(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 def _as_arrays(found: Registration) -> dict[str, Array]:
-    """Return the arrays of a registration, keyed by their names in the store. They are the matrix, and if
-    present the bend and the mask of defects.
+    """Return the arrays of a registration, keyed by their names in the store. They are the matrix and, if
+    present, the bend and the mask of defects.
     """
     made = {"scan_to_layout": found.scan_to_layout}
     if found.bend_um is not None:

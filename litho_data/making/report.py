@@ -41,7 +41,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
     ``report.html``.
     """
     store = open_store(store_path)
-    # Otherwise, a table that this report lacks would remain from an earlier build.
+    # Tables of an earlier build are removed, because this report may not have them.
     for stale in (path for name in _SOMETIMES for path in folder.glob(f"{name}.*")):
         stale.unlink()
     page = Page(

@@ -1,4 +1,5 @@
-"""Find scans that do not show the layout with the same id, because ids, files or doses were mixed up.
+"""Find scans that were combined with a wrong layout or a wrong dose, because ids, files or doses were mixed
+up.
 
 A scan that could be registered may still show a similar layout, a mirror image of its layout, or its layout
 printed at another dose. A scan that could not be registered may show another layout of the dataset.
@@ -21,7 +22,8 @@ _BLUR_PX = 3.0
 _SIDE_PX = 128
 # Number of outermost pixels whose heights are compared with those of the inner pixels.
 _EDGE_PX = 2
-# The correlation of a scan with another layout must exceed that with its own layout by this much.
+# A scan is reported if its correlation with another layout exceeds its correlation with its own layout by
+# more than this.
 _BETTER = 0.02
 # An unregistered scan is said to show a layout if its correlation with this layout is at least the first
 # value, and exceeds the correlation with every other layout by more than the second value. At the best shift,
@@ -128,8 +130,8 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose heights fit another layout of the dataset better than the layout onto which they
-    were registered: for each scan, its id and a message that says what is wrong.
+    """Yield the id and a message for every scan whose heights fit another layout of the dataset better than
+    the layout onto which it was registered.
     """
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
@@ -159,9 +161,9 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans that are mirrored relative to their layout, and the scans whose rotation differs from
-    that of most scans: for each scan, its id and a message that says what is wrong. Scans for which the card
-    states that the print was rotated are ignored.
+    """Yield the id and a message for every scan that is mirrored relative to its layout, or whose rotation
+    differs from the rotation of most scans. Scans for which the card states that the print was rotated are
+    ignored.
     """
     upright = [one for one in prints if not one.turned]
     usual, count = Counter(one.dihedral for one in upright).most_common(1)[0] if upright else ("", 0)
@@ -175,9 +177,9 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose height per level differs clearly from that of their own group (dose or print) and
-    is closest to that of another group, and the scans whose doses seem to be swapped: for each
-    scan, its id and a message that says what is wrong.
+    """Yield the id and a message for every scan that seems to belong to another group (dose or print). The
+    height per level of such a scan differs clearly from the height per level of its own group, and is closest
+    to that of another group. Scans whose doses seem to be swapped are yielded too.
     """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
@@ -215,10 +217,10 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
     relative growth of this slope with the dose, d ln slope / d ln dose.
 
-    The exposure is the level times the dose. The curve g of heights against blurred levels T therefore also
-    shows how a larger dose would change the slope: the growth is cov(T, T g') / cov(T, g). Here, g is a
-    fitted parabola, so the growth is one plus the share of the slope that comes from the quadratic term. In a
-    saturated print, the growth is negative.
+    The exposure is the level times the dose. The curve g(T) of the heights against the blurred levels T
+    therefore determines how a larger dose changes the slope. The growth is cov(T, T g') / cov(T, g). Here, g
+    is a fitted parabola, so the growth is one plus the share of the slope that comes from the quadratic term.
+    In a saturated print, the growth is negative.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)
@@ -247,12 +249,12 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Return messages for the doses that seem to be swapped, keyed by dose. If the height per level nowhere
-    falls clearly from one dose to a larger one, the result is empty.
+    """Return messages for the doses that seem to be swapped, keyed by dose. If no dose has a clearly smaller
+    height per level than a smaller dose, the result is empty.
 
     Args:
         rising: for each dose, the median logarithm of the height per level and the number of scans. It
-            contains only doses at which a larger dose should raise the height.
+            contains only doses at which the height grows with the dose.
         scatter: standard deviation, from scan to scan, of the logarithm of the height per level at one dose.
     """
     doses = sorted(rising)

@@ -72,7 +72,8 @@ class Operation:
 
     Args:
         name: name of the operation in the records.
-        version: version of the operation. It is changed whenever the function may give different results.
+        version: version of the operation. A change of the function that may change its results gets a new
+            version.
         function: function ``function(params, files, arrays)`` that returns a mapping from names to arrays,
             and a mapping of facts.
         takes: names of the input arrays, in the order in which they are recorded. Arrays that a scan does not

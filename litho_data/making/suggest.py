@@ -1,5 +1,5 @@
-"""Compare levelling recipes on three scans of a dataset card. The suggested recipe is the one after which the
-layout explains the heights best.
+"""Compare levelling recipes on three scans of a dataset card. The suggested recipe is the one whose levelled
+heights agree best with the layout.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ _PROCESS = re.compile(r"^[ \t]*\[[ \t]*process[ \t]*\][ \t]*(#.*)?$", re.MULTILI
 class Suggestion:
     """The suggested recipe, and the residuals of all recipes in nm.
 
-    ``left_nm[recipe][scan]`` is the residual: the root mean square of the part of the levelled heights that
-    the layout does not explain, in blocks that were held out of the fit. ``warned`` maps recipes to the
-    warnings about them. ``card`` is the path of the card that was written.
+    ``left_nm[recipe][scan]`` is the root mean square of the residual. The residual is the part of the
+    levelled heights that the layout does not explain. It is computed in blocks that were held out of the fit.
+    ``warned`` maps recipes to the warnings about them. ``card`` is the path of the card that was written.
     """
 
     recipe: str
@@ -84,11 +84,12 @@ def suggest_recipe(
     """Compare recipes on three scans of a card. Write the best recipe, a card that uses it, and a page with
     pictures.
 
-    The field is divided into blocks of 16 px. In half of the blocks, a free function of the blurred layout is
-    fitted to the levelled heights. The recipes are compared by the residual in the other half. This residual
-    contains both the tilt that a recipe fails to remove and the part of the print that the recipe wrongly
-    removes. A recipe is not suggested if one of its steps gives a warning, for example because the step
-    shifts lines that already agree with adjacent lines in many pixels.
+    The field is divided into blocks of 16 px. In half of the blocks, a piecewise linear function of the
+    blurred level is fitted to the levelled heights. The recipes are compared by the residual of this fit in
+    the other half. This residual contains both the tilt that a recipe fails to remove and the part of the
+    print that the recipe wrongly removes. A recipe is not suggested if it cannot be applied to one of the
+    scans, or if one of its steps gives a warning. For example, the alignment of rows warns if it shifts lines
+    that probably had no offset.
 
     Args:
         card_path: path of the card. ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside
@@ -97,8 +98,9 @@ def suggest_recipe(
         data_dir: folder of the raw files, as for ``build_dataset``.
 
     Raises:
-        InputError: the card is bad or describes micrographs, no scan can be read and registered, no recipe
-            can be applied, or its name cannot be added to the card as a line.
+        InputError: the card is bad or describes micrographs, no scan can be read and registered, every recipe
+            gives a warning or cannot be applied, or the name of the best recipe cannot be added to the card
+            as a line.
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
@@ -142,7 +144,8 @@ def suggest_recipe(
 
 def _best(left_nm: Mapping[str, float]) -> str:
     """Return the name of the recipe with the smallest residual. If simpler recipes have nearly the same
-    residual, return the simplest of them. Recipes are listed from the simplest to the most complex.
+    residual, return the simplest of them. ``left_nm`` lists the recipes from the simplest to the most
+    complex.
     """
     least = min(left_nm.values())
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
@@ -174,8 +177,8 @@ def _levelled(recipe: str, raw_um: Array, layout: Array, mask: Array | None) -> 
 def left_by_layout(height_um: Array, layout: Array) -> float:
     """Return the root mean square, in µm, of the part of the heights that the layout does not explain.
 
-    A free function of the layout is fitted to the heights in half of the blocks of the field. The result is
-    computed from the residuals in the other half.
+    A piecewise linear function of the blurred level is fitted to the heights in half of the blocks of the
+    field. The result is computed from the residuals of this fit in the other half.
 
     Args:
         height_um: levelled heights in µm, shape (ny, nx), NaN where not measured.

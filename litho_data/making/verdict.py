@@ -71,12 +71,12 @@ def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
 
 
 def require_heights(prints: Sequence[Print], card: Card) -> None:
-    """Reject a card whose level height cannot belong to the prints, for example because it is a wavelength in
-    nm.
+    """Reject a card whose level height is far from the measured one, for example because the card states a
+    wavelength in nm.
 
     Raises:
-        InputError: the height per level of the prints is more than 100 times that of the card, or less than a
-            hundredth of it.
+        InputError: the height per level of the prints is more than 100 times the level height in the card, or
+            less than a hundredth of it.
     """
     times = _height_times(prints, card)
     if times and not 1 / _IMPOSSIBLE < times < _IMPOSSIBLE:
