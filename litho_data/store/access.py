@@ -89,7 +89,7 @@ def values_if_any(parent: zarr.Group, name: str) -> Array | None:
     """Return all values of the child array ``name`` of a group, or None if there is no such child.
 
     Raises:
-        InputError: the child is a group or damaged, or a stored chunk cannot be decoded.
+        InputError: the child is a group, its metadata are damaged, or a stored chunk cannot be decoded.
     """
     import zarr
 

@@ -1,5 +1,5 @@
-"""References to scans of a store by their ids. They are sent to other processes, which read the scans from
-the store instead of receiving their arrays.
+"""Refer to scans of a store by their ids. Such a reference is sent to other processes in place of the arrays,
+and these processes read the scans from the store.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks made when a store is opened. A store is refused if a file that its metadata declare is missing or a
+"""Check a store when it is opened. A store is refused if it lacks a file that its metadata declare, or if a
 value is out of range.
 """
 
@@ -48,7 +48,8 @@ _LEADS_OUT = re.compile(r"(^|/)\.\.(/|$)|[\\:\x00]")
 
 
 def require_complete(path: Path) -> None:
-    """Refuse a store that has lost a file, because zarr would read zeros or NaN in its place.
+    """Refuse a store if one of its files is missing. Without this check, zarr would read zeros or NaN in
+    place of the file.
 
     Raises:
         InputError: a file is missing; the message names the first one.
@@ -63,8 +64,8 @@ def require_complete(path: Path) -> None:
 
 
 def missing_files(path: Path) -> Iterator[str]:
-    """Yield the names of metadata documents and chunks that the metadata of a store declare but that do not
-    exist.
+    """Yield the names of missing metadata documents and chunks. A file is missing if it does not exist,
+    although the metadata of the store declare it.
     """
     names = file_names(path)
     with damaged(f"metadata of {path}"):
@@ -83,11 +84,11 @@ def missing_files(path: Path) -> Iterator[str]:
 
 
 def _may_be_left_out(name: str, document: Facts) -> bool:
-    """Return whether the chunk of this array may be missing because the store is a copy made by xarray.
+    """Return whether the chunk of this array may be missing in a copy of a store that xarray made.
 
-    When xarray copies a store, it does not write groups or chunks that contain only fill values. Such a chunk
-    can occur in the column ``order`` if the copy has a single scan of order 0, and in an optional column that
-    is empty for all scans of the copy.
+    When xarray copies a store, it writes no groups, and no chunks that contain only fill values. An optional
+    column has such a chunk if it is empty for all scans of the copy. The column ``order`` has such a chunk if
+    the copy has a single scan, of order 0.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
@@ -123,8 +124,8 @@ def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
 
 
 def _chunks(document: Facts) -> Iterator[str]:
-    """Yield the names of the chunk files that an array with this metadata document has, relative to its
-    folder.
+    """Yield the names of the chunk files of an array, relative to its folder. ``document`` is the metadata
+    document of the array.
     """
     sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
     encoding = document["chunk_key_encoding"]
@@ -159,8 +160,8 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
-    """Return the arrays over all scans, keyed by name. Raise InputError if one of these arrays is missing or
-    has a wrong shape, type or dimensions.
+    """Return the arrays that have one entry per scan, keyed by name. Raise InputError if one of these arrays
+    is missing or has a wrong shape, type or dimensions.
     """
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
@@ -185,11 +186,11 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copied store if its coordinates show that rows or columns were reordered, or that rows or
-    columns other than the last ones were removed.
+    """Refuse a copied store in which rows or columns were reordered, or rows or columns other than the last
+    ones were removed. The coordinates of the pixels show such changes.
 
-    Positions in the store, such as the transforms of the scans, are relative to the first pixel, so a copy
-    may leave out only the last rows and columns.
+    Positions in the store, such as the transforms of the scans, are relative to the first pixel. A copy may
+    therefore leave out only the last rows and columns.
 
     Raises:
         InputError: the copy is refused; the message names the coordinate.
@@ -207,8 +208,8 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
-    """Return the columns of a store, which have one value per scan, keyed by name: ``scan`` (the ids),
-    ``print``, ``order`` and all optional columns.
+    """Return the columns of a store, keyed by name: ``scan`` (the ids), ``print``, ``order`` and all optional
+    columns. Each column has one value per scan.
 
     Missing numbers are returned as None, and missing strings as "".
 
@@ -233,7 +234,7 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
         column = values_if_any(root, name)
         if column is not None:
             values = column.tolist()
-            # The condition is false for NaN, which is not equal to itself.
+            # NaN is not equal to itself, so this condition leaves it out.
             limits.require(f"{name} of {path}", [value for value in values if value == value])
             columns[name] = [float(value) if value == value else None for value in values]
     for name in TEXT_COLUMNS:
@@ -289,9 +290,10 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
 
 
 def require_manifest(manifest: Facts, path: Path) -> None:
-    """Refuse a manifest that lacks entries that its readers need.
+    """Refuse a manifest if an entry is missing that other functions read.
 
-    A manifest that contains only the table of files was not written by a build, and needs fewer entries.
+    A manifest that was not written by a build contains only the table of files. Fewer entries are then
+    required.
 
     Raises:
         InputError: an entry is missing or has the wrong type; the message names the first one.

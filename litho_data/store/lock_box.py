@@ -1,8 +1,8 @@
 """Choose the lock box of a dataset: scans that are set aside for the final test, so they must not influence
 any choice of a model or an effect.
 
-The choice depends on a hash of the ids instead of a library's random generator, so the same ids always give
-the same lock box.
+The scans are drawn by the hashes of their ids and prints, and not by the random generator of a library. The
+same dataset therefore always has the same lock box.
 """
 
 import hashlib
@@ -17,8 +17,8 @@ FIELD_COLUMNS = ("field_x_um", "field_y_um", "dose")
 
 
 class HasField(Protocol):
-    """Protocol for objects that state the id of a scan and the printed field that it shows, which determine
-    whether the scan is put into the lock box.
+    """Protocol for objects that state the id of a scan and describe the printed field that the scan shows.
+    The id and the field determine whether the scan is put into the lock box.
     """
 
     @property
@@ -60,10 +60,10 @@ def field_sha256(print_id: str, mask_level: Array, stated: Sequence[float | None
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str], fields: Sequence[str]) -> list[str]:
-    """Return the ids of the scans in the lock box: all scans of a sixth of the printed fields, but of at
-    least one field, and from different prints if possible.
+    """Return the ids of the scans in the lock box. It contains all scans of a sixth of the printed fields,
+    and of at least one field. If possible, the fields are from different prints.
 
-    If the dataset has only one or two fields, none is chosen.
+    If the dataset has only one or two fields, the lock box is empty.
 
     Args:
         ids: ids of the scans.
@@ -91,7 +91,7 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str], fields: Sequence[str]
 def scans_by_field(ids: Sequence[str], fields: Sequence[str], seed: int) -> list[list[str]]:
     """Return the ids of the scans of each printed field, with the fields in a random order.
 
-    Scans of one field share the errors of its print, so they are never divided between training and test.
+    Scans of one field share the errors of the print, so they must not be divided between training and test.
     """
     found: dict[str, list[str]] = {}
     for scan_id, of in sorted(zip(ids, fields, strict=True), key=lambda one: drawing_key(one[0], seed)):

@@ -60,7 +60,7 @@ def partial_store(out: Path) -> Iterator[PartialStore]:
 
 
 class PartialStore:
-    """A store under construction, with methods to list the finished scans on disk, add scans, and publish the
+    """A store under construction. Its methods list the finished scans on disk, add scans, and publish the
     store.
     """
 
@@ -89,13 +89,13 @@ class PartialStore:
         return root
 
     def finished(self, root: zarr.Group, keys: Facts) -> dict[str, dict[str, Any]]:
-        """Return the records of the finished scans that need not be computed again, keyed by id. Remove all
-        other scans.
+        """Remove the scans that must be computed again. Return the records of the other finished scans, keyed
+        by id.
 
         Args:
             root: the root group to which scans are added.
-            keys: maps the id of each scan of the build to a function that returns the key of the scan, i.e. a
-                hash of everything that determines it.
+            keys: for each scan of the build, a function that returns the scan's key, i.e. a hash of
+                everything that determines the scan. The functions are keyed by id.
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):

@@ -1,5 +1,5 @@
-"""Class PrintedScan, the form in which the whole project handles one printed field, and the hash of its
-content.
+"""Define PrintedScan, which contains the layout and the heights of one printed field and is used in the whole
+project. The module also computes the hash of its content.
 """
 
 import math
@@ -25,8 +25,8 @@ class PrintedScan:
         height_um: measured height of each pixel in µm, shape (ny, nx), float32; NaN where not measured.
         valid: bool array of shape (ny, nx) that is True where the pixel was measured and lies inside the
             scan.
-        pitch_um: pixel pitch of all three arrays, µm. ``level_height_um`` is the nominal height of a level,
-            µm.
+        pitch_um: pixel pitch of ``mask_level``, ``height_um`` and ``valid``, µm. ``level_height_um`` is the
+            nominal height of a level, µm.
         levels: number of levels that the layout may use.
         scan_to_layout: 3 x 3 matrix, float64, that maps homogeneous coordinates (x_um, y_um, 1) in the scan's
             own frame to those in the layout frame.
@@ -44,13 +44,13 @@ class PrintedScan:
         height_sigma_um: standard uncertainty of ``height_um`` in µm, shape (ny, nx), float32; NaN where not
             valid. It does not include the uncertainty of the scan's zero height. None means that the store
             does not contain it.
-        groups: values that the named groups of the dataset card's id pattern capture from this scan's id,
-            such as the number of the field. The group ``print`` is left out.
+        groups: parts of the scan's id, such as the number of the field. The named groups of the id pattern in
+            the dataset card capture them. The group ``print`` is left out.
         instrument: name of the instrument, if the card's table gives it. ``seen_by`` is the kind of
             instrument, which determines what the heights mean (see ``Instrument``).
         surround: what lies around the printed field. ``substrate`` means bare substrate, which the layout
-            shows as a rim of level 0. ``continues`` means more of the same print; because the layout does not
-            show it, the outermost pixels are not valid. The default is ``unknown``.
+            shows as a rim of level 0. ``continues`` means more of the same print. The layout does not show
+            this part of the print, so the outermost pixels are not valid. The default is ``unknown``.
     """
 
     id: str

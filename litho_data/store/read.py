@@ -1,4 +1,4 @@
-"""Read a dataset store. It is checked once when it is opened, and then read one scan at a time."""
+"""Read a dataset store. It is checked once, when it is opened. Its scans are then read one at a time."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def open_store(path: str | Path) -> Store:
 
 
 class Store:
-    """A dataset of printed scans; arrays are read when they are needed, never all at once."""
+    """A dataset of printed scans. It keeps no arrays in memory, and reads an array when it is needed."""
 
     def __init__(self, root: zarr.Group, path: Path):
         self.path = path
@@ -135,10 +135,11 @@ class Store:
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
-        """Return the named groups of the card's id pattern, except ``print``, with their values for one id.
+        """Match one id with the id pattern of the card, and return the values of the pattern's named groups.
+        The group ``print`` is left out.
 
-        If the pattern contains repetitions, return no groups: in a store of unknown origin, matching such a
-        pattern might never finish.
+        If the pattern contains repetitions, the result is empty, because matching such a pattern may never
+        finish, and the store may come from anywhere.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -156,7 +157,7 @@ class Store:
         return [self.scan(scan_id) for scan_id in self.ids]
 
     def sample(self, name: str, row: int) -> Array:
-        """Read one scan's part of the array ``name`` over all scans, without its padding. ``row`` is the
+        """Read the part of the array ``name`` that belongs to one scan, without its padding. ``row`` is the
         position of the scan in ``ids``.
 
         Raises:

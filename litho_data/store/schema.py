@@ -45,7 +45,7 @@ class Variable:
         return self.wider if str(sample.dtype) == self.wider else self.dtype
 
     def sample_sha256(self, sample: Array) -> str:
-        """Return the hash of one scan's part of the array, given without padding."""
+        """Return the hash of one scan's part of the array. ``sample`` is this part without padding."""
         return array_sha256(np.asarray(sample, dtype=self.stored_as(sample)), self.unit, self.sample_dims)
 
 

@@ -36,8 +36,8 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Write the arrays of one scan that lie on its own pixel grid as the group ``scans/<id>``. The group is
-    also an OME-Zarr image.
+    """Write the group ``scans/<id>``. It contains those arrays of a scan that lie on the scan's own pixel
+    grid, and is also an OME-Zarr image.
 
     Args:
         root: the open root group of the store.
@@ -73,7 +73,7 @@ def write_samples(
     load: Callable[[str], Mapping[str, Array]],
     pitch_um: float,
 ) -> None:
-    """Write the arrays over all scans, one scan at a time.
+    """Write the arrays that have one entry per scan. One scan is written at a time.
 
     Args:
         root: the open root group of the store.
@@ -128,7 +128,8 @@ def write_table(
     """Write a table as a group of one-dimensional arrays over ``dim``; all strings are encoded in UTF-8.
 
     Only one array per type of column is created, in memory. Each column is written to the array of its type,
-    whose files are then copied to the store. This takes a third of the time of creating one array per column.
+    and the files of this array are then copied to the store. To create one array per column would take three
+    times as long.
     """
     import zarr
     from zarr.storage import MemoryStore
@@ -171,8 +172,8 @@ def _column(group: zarr.Group, name: str, size: int, dim: str, dtype: Any, **mor
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
     """Create an array, compressed by Zstandard after a byte shuffle, with a checksum that reveals damage.
 
-    Chunks that contain only fill values are written too. By default, zarr writes no file for such a chunk,
-    and it could not be distinguished from a chunk that was lost.
+    Chunks that contain only fill values are written too. By default, zarr writes no file for such a chunk.
+    The chunk could then not be distinguished from a lost one.
     """
     from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -213,8 +214,8 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
 
 
 def _padded(name: str, sample: Array, shape: Shape) -> Array:
-    """Pad one scan's array to the common shape: the array is in the upper left corner, and the value from
-    ``PADDING`` elsewhere.
+    """Pad one scan's array to the common shape. The array lies in the upper left corner, and all other pixels
+    have the value from ``PADDING``.
     """
     if sample.shape == shape:
         return sample
