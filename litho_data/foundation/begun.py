@@ -59,13 +59,13 @@ def growing_folder(
             this file last.
         facts: fields of the record that determine the result. A folder whose record has other values of these
             fields is refused.
-        holds: names of files that the folder may contain before the result is begun, such as designs that
-            were made one by one.
+        holds: pattern of the names of files that the folder may contain before the result is begun, such as
+            designs that were made one by one.
 
     Raises:
-        InputError: ``out`` is a file, contains something other than this result, contains a result of this
-            kind whose ``facts`` differ, is being written by another process, or cannot be written. The error
-            is raised before the ``with`` block begins.
+        InputError: ``out`` is a file, cannot be written, or is being written by another process. The error is
+            also raised if ``out`` contains something other than this result, such as a result of this kind
+            with other ``facts``. It is raised before the ``with`` block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)

@@ -1,5 +1,5 @@
-"""InputError, the only exception of the project whose message is written for users, and helpers that raise
-it.
+"""Define InputError and functions that raise it. InputError is the only exception of the project whose
+message is written for users.
 """
 
 import difflib
@@ -42,9 +42,9 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Turn any error that the content of a file causes in the ``with`` block into an InputError which says
-    that the file is damaged. Use it to read files that a program wrote but that somebody may have edited
-    since.
+    """Raise an InputError which says that a file is damaged, if the content of the file causes an error in
+    the ``with`` block. Use this function for files that a program wrote and that somebody may have edited
+    later.
 
     Raises:
         InputError: the content of the file causes an error, such as a missing key, text instead of a number,

@@ -1,4 +1,4 @@
-"""Lazy loading of the public names of a package: each name is imported when it is first used."""
+"""Load the public names of a package lazily: each name is imported when it is first used."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 _DISTRIBUTION = "litholoop"
-# Both extras, `models` and `design`, install torch, and litho_data alone does not need it. If torch is
+# The extras `models` and `design` both install torch, which litho_data alone does not need. If torch is
 # missing, neither extra is installed.
 _OF_EXTRAS = "torch"
 # These environment variables make waiting threads sleep. The first is read by GNU's OpenMP, the second by
@@ -82,7 +82,9 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
 
 
 def require_extra(command: str, extra: str) -> None:
-    """End a command with one line on stderr and exit code 2 if the extra that it needs is not installed."""
+    """End a command with one line on stderr and exit code 2 if it needs optional packages that are not
+    installed. ``extra`` is the name under which pip installs these packages.
+    """
     let_waiting_threads_sleep()
     if importlib.util.find_spec(_OF_EXTRAS) is None:
         print(f"{command}: {_missing(extra)}", file=sys.stderr)

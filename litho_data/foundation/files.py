@@ -51,8 +51,8 @@ def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
     For a path that a user chose, use ``litho_data.foundation.begun.whole_folder`` instead.
 
     Args:
-        wait: if another process is writing the folder, true means to wait for it and false means to raise an
-            InputError.
+        wait: whether to wait if another process is writing the folder. If false, an InputError is raised
+            instead.
 
     Raises:
         InputError: ``path`` cannot be written, or another process is writing it.

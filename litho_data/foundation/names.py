@@ -1,4 +1,4 @@
-"""Check that names found in files from elsewhere are plain before they become part of a path."""
+"""Check names that come from files of unknown origin. Only plain names may become part of a path."""
 
 import re
 from typing import Annotated
@@ -13,8 +13,8 @@ _NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
 
 
 def is_plain_name(name: object) -> bool:
-    """Return whether the text is a valid file name on every system, and not a path, a hidden file or a
-    command-line option.
+    """Return whether a name is plain. A plain name is a valid file name on every system. It cannot be
+    mistaken for a path, a hidden file or a command-line option.
     """
     return (
         isinstance(name, str)

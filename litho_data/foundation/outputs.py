@@ -16,8 +16,8 @@ from litho_data.foundation.kinds import Facts
 
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
-    """Accept a path that does not exist, an empty folder, or a folder that contains nothing but an older
-    result, in its subfolders too.
+    """Accept a path that does not exist, an empty folder, or a folder in which all files belong to an older
+    result. The files in its subfolders are checked too.
 
     Args:
         path: where the result will be.
@@ -25,8 +25,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
             contain, relative to the folder. If a path names a subfolder, this subfolder may contain anything.
 
     Raises:
-        InputError: the path is the current folder, a file, or a folder that contains anything else; the
-            message names it.
+        InputError: the path is the current folder or a file, or the folder contains a file that does not
+            belong to an older result. The message names what was found.
     """
     folder = Path(path)
     if folder.exists() and folder.samefile(Path.cwd()):
@@ -38,8 +38,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
     _refuse_a_file(folder)
     patterns = [pattern.split("/") for pattern in holds]
     paths = sorted(path.relative_to(folder) for path in folder.rglob("*"))
-    # A path and a pattern are compared only up to the length of the shorter one. The parent folders of a file
-    # therefore match the file's pattern too.
+    # If a path and a pattern have different numbers of parts, only the parts that both have are compared. The
+    # parent folders of a file therefore match the file's pattern too.
     strangers = (one for one in paths if not any(all(map(fnmatch, one.parts, held)) for held in patterns))
     if stranger := next(strangers, None):
         raise InputError(
@@ -50,8 +50,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Facts) -> None:
-    """Refuse a folder whose existing result was made with other settings: raise InputError if the record
-    ``held`` of the finished or begun result differs from ``facts``.
+    """Refuse a folder whose result was made with other settings. ``held`` is the record of this finished or
+    begun result. Raise InputError if ``first_difference`` finds a difference between ``held`` and ``facts``.
     """
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
@@ -64,11 +64,12 @@ def require_same(folder: Path, held: Any, facts: Facts) -> None:
 
 
 def first_difference(then: Facts, now: Facts, *above: str) -> str:
-    """Return the first setting of ``now`` that is missing in ``then`` or has another value there; return ""
-    if there is none.
+    """Return a text that names the first setting that differs between ``then`` and ``now``. If no setting
+    differs, return "".
 
-    The older record, and the mappings directly in it, such as the dataset, may contain keys that ``now``
-    lacks. Mappings nested more deeply, such as the values that were set by name, may not contain such keys.
+    A setting in ``now`` differs if it is missing in ``then`` or has another value there. A setting that is
+    only in ``then`` differs if it lies more than one mapping deep in the record, for example among values
+    that were set by name. Elsewhere, for example in the mapping of the dataset, such a setting is ignored.
 
     Args:
         then, now: the older and the requested settings.
@@ -89,11 +90,11 @@ def first_difference(then: Facts, now: Facts, *above: str) -> str:
 
 
 def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
-    """Accept a path that does not exist, an empty folder, or a folder with the same kind of result, whose
-    record file is ``record``.
+    """Accept a path that does not exist, an empty folder, or a folder that contains a result of the same
+    kind.
 
-    A file counts as the record of a result if its name matches the kind of result that its schema names. For
-    example, ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.
+    A JSON file counts as the record of a result if its name matches its schema. For example, the name
+    ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.
 
     Args:
         path: folder of the result. If it already holds a result of this kind, other files in it are left

@@ -1,5 +1,5 @@
-"""Load plug-ins, which are modules of users that register additional readers, effects or models when they are
-imported.
+"""Load plug-ins. A plug-in is a module that a user wrote. When it is imported, it registers additional
+readers, effects or models.
 
 A plug-in is found through its entry point in the group ``litholoop.plugins``, or given as a file. Every
 command and every worker loads all plug-ins before its work begins.
@@ -63,8 +63,8 @@ def plugin_versions() -> dict[str, str]:
 
 
 def foreign_sha256(function: Callable[..., Any]) -> str:
-    """Return the hash of the source code that defines a function or a class: a file, a package or a cell of a
-    notebook. The result is empty for the code of this project and for compiled code.
+    """Return the hash of the file, package or notebook cell that defines a function or a class. For code of
+    this project and for compiled code, the result is empty.
     """
     code = inspect.unwrap(function.func if isinstance(function, partial) else function)
     named = inspect.isroutine(code) or inspect.isclass(code)
@@ -90,8 +90,8 @@ def _file_of(code: Callable[..., Any]) -> str:
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split a command line: return its words without any ``--plugin FILE``, and the list of the plug-in
-    files.
+    """Take the options ``--plugin FILE`` out of a command line. Return the other words, and the list of the
+    plug-in files.
 
     Raises:
         InputError: the option is given without a file.

@@ -1,5 +1,5 @@
-"""Allowed ranges of physical quantities: annotated types for the fields of records, and checks for all other
-values.
+"""Define the allowed ranges of physical quantities. Annotated types check the fields of records, and
+``Range`` checks all other values.
 """
 
 from dataclasses import dataclass

@@ -25,7 +25,8 @@ class RunFacts(Record):
     """The command line and the version of the code that made a result.
 
     ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed from the
-    commit. It is None if the code did not run from a Git checkout, and in result files of older versions.
+    commit. ``dirty`` is None if the code did not run from a Git checkout, or if an older version wrote the
+    result.
     """
 
     command: str = ""
