@@ -3,8 +3,8 @@ heights.
 
 In a micrograph, the film is brighter than the ground, and its rim is brightest. Charging changes the
 brightness from place to place. The edge is therefore placed where the brightness is half way between the
-brightness of the ground nearby and that of the rim nearby. This position is a convention. The wall of the
-film may lie elsewhere on the flank of the bright rim, and a micrograph cannot show where.
+brightness of the nearby ground and the brightness of the nearby rim. This position is a convention. The wall
+of the film may lie elsewhere on the flank of the bright rim, and a micrograph cannot show where.
 """
 
 from typing import NamedTuple

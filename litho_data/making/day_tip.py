@@ -14,7 +14,7 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
     """Estimate the radius of the tip if the card of the jobs states ``tip = "blind"``. Return the jobs with
-    this radius in place of "blind". All other jobs are returned unchanged.
+    this radius in place of "blind". Otherwise, return the jobs unchanged.
 
     If the scans set no upper limit on the radius, the returned jobs have no tip radius. The estimate is also
     printed on stderr. Scans that cannot be read are not used for the estimate. The build reports later why

@@ -264,7 +264,7 @@ def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
     layout-aware ones, because no layout can be located in a reference scan.
 
     In scans of a flat surface, polynomial steps of the same degrees replace the layout-aware steps. In scans
-    of steps and gratings, polynomials would remove part of the structure, so layout-aware steps are left out.
+    of steps and gratings, nothing replaces them, because polynomials would remove part of the structure.
     """
     kept = []
     for step in steps:

@@ -41,11 +41,11 @@ class Print:
     """One registered scan. Its heights and its blurred layout are sampled at a few points.
 
     ``response`` contains the height per level in µm, and the relative growth of this height with the dose.
-    ``edge_times`` is the rms deviation of the outermost pixels from the blurred layout, divided by the rms
-    deviation of the inner pixels. ``dihedral`` is the orientation that the registration found, and ``turned``
-    is true if the card states that the print was rotated under the microscope. Scans in the same ``group``
-    should have the same height per level. The group is the dose if the card states it, and the print
-    otherwise.
+    ``edge_times`` compares the deviations of the heights from the blurred layout: it is the rms deviation of
+    the outermost pixels divided by the rms deviation of the inner pixels. ``dihedral`` is the orientation
+    that the registration found, and ``turned`` is true if the card states that the print was rotated under
+    the microscope. Scans in the same ``group`` should have the same height per level. The group is the dose
+    if the card states it, and the print otherwise.
     """
 
     id: str

@@ -68,7 +68,7 @@ def cut_layout(array: Array) -> Array:
 
 
 def set_layout(array: Array, inner: Array) -> Array:
-    """Return a copy of an array on the canvas. In the copy, ``inner`` replaces the values inside the layout."""
+    """Return a copy of an array on the canvas, with the values inside the layout replaced by ``inner``."""
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed

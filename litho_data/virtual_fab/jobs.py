@@ -35,7 +35,7 @@ class Plan:
         size_px: shape (ny, nx) of each layout, in pixels.
         fields_per_print: number of fields in each print.
         write_field_um: side, in µm, of the write field that all fields of a print share. With None, each
-            field has its own write field and lies at its centre.
+            field lies at the centre of its own write field.
         references: whether to add print 0, which consists of a bare substrate, a flat print and a staircase
             of five steps.
     """

@@ -68,7 +68,7 @@ def simulate(
         printer: your own printer; None stands for the default printer.
         fields_per_print: number of fields in each print.
         write_field_um: side, in µm, of the write field that all fields of a print share. With None, each
-            field has a write field of its own.
+            field has its own write field.
         references: whether to add scans of a bare substrate, a flat print and a staircase of five steps.
         jobs: your own layouts, which are printed in place of random ones. Arguments about random layouts are
             then ignored.
