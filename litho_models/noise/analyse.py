@@ -35,13 +35,13 @@ def analyse_noise(
     """Analyse the noise of the prints in a store. Write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. Scans that the store marks as bare substrate, flat print or steps, and scans
-            that state a dose, are also analysed.
+        store: dataset store. The analysis also uses its scans of bare substrates, flat prints and steps, and
+            all scans that state a dose.
         out: result folder.
         residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
-            The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. If none of
-            the scans was used to train the model that predicts it (as in a benchmark), the analysis also
-            contains the noise budget.
+            With residuals, the analysis also contains the spread σ(x) of the residual at each pixel, and a
+            test of whether this spread is calibrated. If every scan is predicted by a model that was not
+            trained on it (as in a benchmark), two upper limits of the noise are added (see ``NoiseBudget``).
         model: name of a model in the benchmark; by default the best model.
         seed: seed of the random choice of pixels.
 
@@ -109,8 +109,8 @@ def analyse_noise_of_files(
     Args:
         out: result folder.
         flat, substrate, steps: scan files of a flat print, of the bare substrate and of a print of steps.
-        unit, size_um: unit of the heights, and size of the scan along y and x, µm. Both are needed only if
-            the files do not state them.
+        unit, size_um: unit of the heights, and size of the scan along y and x, µm. Each is needed only if the
+            files do not state it.
         level_height_um: nominal height of one step, µm.
 
     Raises:

@@ -1,7 +1,7 @@
 """Estimate the noise of ordinary prints from the residuals of a model on held-out scans.
 
-There are two estimates of an upper limit of the noise. The first compares residuals at pixels whose
-surroundings in the layout are similar (``estimated_floor``). The second estimate is the roughness of the
+There are two estimates of an upper limit of the noise. The first estimate compares residuals at pixels whose
+surroundings in the layout are similar (``floor_of_residuals``). The second estimate is the roughness of the
 residual in areas where the layout is flat. In such areas the errors of a model are small, so nearly all of
 the residual is noise.
 """
@@ -25,10 +25,10 @@ _FEWEST_PIXELS = 1000
 
 
 class FlatLevel(Record):
-    """The residual at the pixels of one level where the layout is flat: its rms (``sigma_nm``) and its mean
-    absolute value (``mae_nm``).
+    """The size of the residual at those pixels of one level at which the layout is flat: its rms
+    (``sigma_nm``) and its mean absolute value (``mae_nm``).
 
-    The terms of the policy ``full+rows``, which include line offsets, are removed from each scan first.
+    Before that, the terms of the policy ``full+rows`` are removed from each scan. They include line offsets.
     ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm``, from resampling prints.
     """
 
@@ -43,10 +43,10 @@ class FlatLevel(Record):
 class NoiseBudget(Record, extra="ignore"):
     """Two estimates of an upper limit of the noise of prints.
 
-    ``floor`` comes from pixels with similar surroundings (see ``estimated_floor``). ``flat_levels`` comes
-    from the quarter of the pixels where the layout is flattest, i.e. where its slope is at most
-    ``flat_slope``. ``flat_texture`` is the texture of the residual at these flattest pixels. Only the terms
-    of the policy ``full`` are removed before the texture is computed, so it still contains line offsets.
+    ``floor`` is computed from pixels with similar surroundings (see ``floor_of_residuals``). ``flat_levels``
+    is computed from the pixels at which the slope of the layout is at most ``flat_slope``, the lower quartile
+    of the slope. ``flat_texture`` is the texture of the residual at these pixels. For the texture, only the
+    terms of the policy ``full`` are removed, so it still contains line offsets.
     """
 
     model: str
@@ -79,7 +79,7 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 
 def _by_level(scans: Sequence[PrintedScan], flat_um: Sequence[np.ndarray]) -> Iterator[FlatLevel]:
-    """Yield the residual of each level that has enough pixels in flat areas."""
+    """Yield the ``FlatLevel`` of each level that has at least ``_FEWEST_PIXELS`` pixels in flat areas."""
     pool = Pool(scans, [np.isfinite(own) for own in flat_um])
     level, residual = pool.of([scan.mask_level for scan in scans]), NM_PER_UM * pool.of(flat_um)
     for value in np.unique(level).tolist():

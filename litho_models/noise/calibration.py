@@ -46,9 +46,12 @@ _MEANS = ("nll", "crps_nm", "ence", "ause")
 # Older result files also contain values for ensembles of models and bounds for whole scans, which are
 # ignored.
 class ScanCalibration(Record, extra="ignore"):
-    """The calibration on one scan: the negative log-likelihood and the continuous ranked probability score
-    (for both, lower is better), the share of residuals inside the stated intervals (coverage) for each of
-    ``Calibration.levels``, and the rms of the ratio of residual to stated standard deviation.
+    """The scores of a stated spread on one scan.
+
+    ``nll`` is the negative log-likelihood, and ``crps_nm`` is the continuous ranked probability score. For
+    both, lower is better. ``coverage`` is the share of residuals inside the stated intervals, for each level
+    in ``Calibration.levels``. ``standardised_rms`` is the rms of the residual divided by the stated standard
+    deviation.
 
     ``ence`` and ``ause`` are fractions, for which 0 is best (see ``spread_scores``).
     """
@@ -67,12 +70,12 @@ class Calibration(Record, extra="ignore"):
 
     Args:
         name: whether the spread is constant or depends on covariates.
-        levels: nominal coverages of the intervals. If the spread is calibrated, the observed coverages equal
-            them.
-        nll, crps_nm, coverage, ence, ause: means of the values of ``ScanCalibration`` over scans.
-        pit: histogram of the probability integral transform. The transform of a pixel is the probability that
-            the stated distribution gives to residuals below the observed one. The 20 bins add up to one. If
-            the stated distribution is right, the histogram is flat.
+        levels: nominal coverages of the intervals. For a calibrated spread, ``coverage`` equals ``levels``.
+        nll, crps_nm, coverage, ence, ause: means over scans of the fields of ``ScanCalibration`` with the
+            same names.
+        pit: histogram of the probability integral transform. The transform of a pixel is the probability,
+            under the stated distribution, of a residual below the observed residual. The 20 bins add up to
+            one. If the stated distribution is right, the histogram is flat.
     """
 
     name: str
@@ -88,8 +91,8 @@ class Calibration(Record, extra="ignore"):
 
 
 class SigmaBin(Record, extra="ignore"):
-    """The measured and the predicted spread of the residual, and the coverage of the stated intervals, for
-    the pixels within one range of one covariate.
+    """The results for the pixels at which one covariate lies in one range: the measured and the predicted
+    spread of the residual, and the coverage of the stated intervals.
 
     The coverages are those of the 68 % and 95 % intervals. Each coverage has a 95 % confidence interval from
     resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.
@@ -110,13 +113,12 @@ class SigmaBin(Record, extra="ignore"):
 
 
 class SpreadAnalysis(Record, extra="ignore"):
-    """The spread σ(x) of the residuals of one model, and its calibration. The values in ``bins`` are computed
-    on scans that were not used to fit the spread, while ``variance`` is a model of the spread that is fitted
-    to all scans.
+    """The spread σ(x) of the residuals of one model, and its calibration. ``bins`` is computed on scans that
+    were not used to fit the spread. ``variance`` is a model of the spread that is fitted to all scans.
 
-    ``nuisance`` names the terms that were removed from the residuals. ``left_out`` says whether prints or
-    scans are left out of each fit of the spread. Each fit is tested on the prints or scans that were left out
-    of this fit.
+    ``nuisance`` names the terms that were removed from the residuals. Each fit of the spread is tested on
+    data that were left out of this fit. ``left_out`` says whether these are all scans of one print
+    (``prints``) or a group of scans (``scans``).
     """
 
     model: str
@@ -143,8 +145,9 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     """Fit and test two models of the spread of the residuals: a constant spread, and a spread that depends on
     covariates. For each print, both models are fitted to all other prints and tested on this print.
 
-    If there are fewer than three prints, groups of scans are left out of the fits instead of prints. The
-    shape and the scale of the distribution of residuals are fitted together.
+    If there are fewer than three prints, the scans are divided into up to five groups, and each group takes
+    the place of a print. The constant spread is the rms of the residuals, with a Gaussian distribution. In
+    the other model, the shape of the distribution is fitted together with the spread.
 
     Raises:
         InputError: there are fewer than three scans.
@@ -233,8 +236,8 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """Yield the bins of pixels. There is one bin with all pixels and one bin for each level. For every other
-    covariate, there are several bins with equal numbers of pixels.
+    """Yield the results for groups of pixels. There is one group with all pixels and one group for each
+    level. For every other covariate, there are several groups with equal numbers of pixels.
     """
     pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
     residual = pool.of(residuals_nm)

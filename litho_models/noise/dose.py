@@ -1,9 +1,9 @@
-"""Evaluate a dose matrix, which is a set of prints at different doses: determine height, roughness and lost
-steps at each dose, and recommend a dose.
+"""Evaluate a dose matrix, which is a set of prints at different doses. For each dose, determine the height,
+the roughness and the number of steps that were lost. Then recommend a dose.
 
 The paper searches for a laser power in this way (appendix "Mask and optical elements fabrication"). The
-evaluation uses all scans that state a dose. The layouts of these scans are step ladders, or any layouts in
-which areas of one level are wider than the blur of the printer.
+evaluation uses all scans that state a dose. Suitable layouts are step ladders, and any other layouts in which
+areas of one level are wider than the blur of the printer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,13 @@ from litho_models.scoring.like_layouts import blurred_layout_um
 # Pixels closer than this to a change of level are not used. The distance is about four standard deviations of
 # the optical spot, or two standard deviations of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
-# A step is lost if its height per level is less than this fraction of the median height per level of all
-# steps at the same dose.
+# A step counts as lost if its height, divided by the number of levels that it spans, is less than this
+# fraction of the median of this ratio over all steps at the same dose.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Distances over which the surroundings of a pixel are averaged. The larger distance exceeds ``_GUARD_UM``,
-# because diffusion reaches up to 2.5 µm.
+# Standard deviations of the Gaussians that average the surroundings of a pixel. The larger of the two exceeds
+# ``_GUARD_UM``, because diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
@@ -46,16 +46,17 @@ class DoseRow(Record, extra="ignore"):
 
     Args:
         dose: dose relative to the nominal dose.
-        height_gain: slope of a straight line fitted to the printed heights of the levels against their
-            nominal heights.
+        height_gain: slope of the printed height of the levels as a function of their nominal height, from a
+            straight-line fit.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation of the height within areas of one level.
-        lost_low: number of steps that are lost at the lowest levels, because under-exposed resist does not
-            remain. A step is lost if its height per level is less than half the median height per level of
-            all steps at this dose. The median is taken at the same dose, so that shrinkage does not count as
-            wrong exposure.
-        lost_high: number of steps that are lost at the highest levels, because over-exposed resist cannot
-            react any further.
+        lost_low: number of lost steps in an unbroken sequence that starts at the lowest level. Steps are lost
+            there because under-exposed resist does not remain. A step counts as lost if its height, divided
+            by the number of levels that it spans, is less than half the median of this ratio over all steps
+            at this dose. The median is taken at the same dose, so that shrinkage does not count as wrong
+            exposure.
+        lost_high: number of lost steps in an unbroken sequence that ends at the highest level. Steps are lost
+            there because over-exposed resist cannot react any further.
         worst_readability: smallest ratio of the height of a step to the standard deviation σ of single pixels
             on its two levels. If this ratio is at least 3.92, single pixels of the two levels can be told
             apart.
@@ -158,8 +159,8 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], list[LevelHeight]]:
     """Return the scans that are used, and the mean and standard deviation of the height of each level. Only
     pixels far from every change of level count. The datum, the tilt and the effect of the surrounding layout
-    are first removed from each scan. Scans that share no level with the others are not used, because their
-    datum is unknown.
+    are first removed from each scan. If no chain of shared levels links a scan to the other scans, it is not
+    used, because its datum is unknown.
     """
     found = [_level_parts(scan) for scan in scans]
     linked = _linked_levels(found)
@@ -180,8 +181,8 @@ def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], lis
 
 
 def _level_parts(scan: PrintedScan) -> dict[int, Array]:
-    """Return the heights of the pixels of each level, nm, that are far from every change of level. The tilt
-    and the effect of the surrounding layout are removed, but not the datum.
+    """For each level, return the heights, nm, of those pixels that are far from every change of level. The
+    tilt and the effect of the surrounding layout are removed, but not the datum.
     """
     inside = _plateaus(scan)
     if not inside.any():
@@ -233,8 +234,8 @@ def _common_heights_nm(scans: Sequence[Mapping[int, Array]]) -> dict[int, float]
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """Return the mean of the layout around each pixel minus the layout at the pixel, µm, for averages over 1
-    µm and over 2 µm. The result has shape (2, ny, nx).
+    """Return blurred layouts minus the layout itself, µm. The blurs are Gaussians with standard deviations of
+    1 µm and 2 µm. The result has shape (2, ny, nx).
     """
     return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 

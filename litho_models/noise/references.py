@@ -114,13 +114,13 @@ def _has_texture(one: Reference) -> bool:
 
 
 class RepeatedPrints(Record):
-    """The noise of a single print, nm, from the differences between repeated prints of one layout. It
-    contains the contributions of printing, of the microscope and, at edges, of the registration.
+    """The noise of a single print, nm, from the differences between repeated prints of one layout. This noise
+    comes from the printing, from the microscope and, at edges, from the registration.
 
     A polynomial of second degree is removed from the difference between two prints, so datum, tilt and bow
     are not included. Errors that repeat from print to print are not included either. ``ci95_nm`` is the 95 %
-    confidence interval of ``sigma_nm``, from resampling whole prints. The interval is None for fewer than six
-    prints, and if every pair contains the same print.
+    confidence interval of ``sigma_nm``, from resampling whole prints. The interval is None if there are fewer
+    than six prints, or if one print belongs to every pair.
     """
 
     sigma_nm: float
@@ -134,12 +134,11 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     variance of the noise is half the variance of the difference between two such prints. Return None if there
     are no repeated prints.
 
-    Of several scans that may show the same printed field, only the first is used, because the difference of
-    two scans of one field does not contain the noise of the print.
+    If several scans may show the same printed field, only the first of them is used, because the difference
+    between two scans of one field does not contain the noise of the print.
 
-    The mean absolute value of the noise is the mean absolute difference divided by √2. Dividing by √2 is
-    exact for Gaussian noise, and correct within a few percent for other distributions of the noise (see
-    ``estimated_floor``).
+    The mean absolute value of the noise is the mean absolute difference divided by √2. The factor √2 is exact
+    for Gaussian noise, and correct within a few percent for other distributions (see ``floor_of_residuals``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}
     for scan in scans:
@@ -171,10 +170,10 @@ def _sigma_interval(squares_nm2: np.ndarray, prints: Sequence[tuple[str, str]]) 
     """Return the 95 % confidence interval of the root of the mean of ``squares_nm2``, which has one value per
     pair of prints.
 
-    Pairs that share a print are not independent. Therefore prints are resampled, each with its jackknife
-    pseudo-value: N times the mean over all pairs minus N - 1 times the mean over the pairs without this
-    print. If all pairs of the N prints are compared and the noise is white, the pseudo-value equals the
-    variance of the noise of this print.
+    Pairs that share a print are not independent. Therefore the N prints are resampled. Each print is
+    represented by its jackknife pseudo-value, which is N times the mean over all pairs minus N - 1 times the
+    mean over the pairs without this print. If all pairs of the N prints are compared and the noise is white,
+    the pseudo-value equals the variance of the noise of this print.
     """
     names = list(dict.fromkeys(name for pair in prints for name in pair))
     without = np.array([[name not in pair for pair in prints] for name in names])

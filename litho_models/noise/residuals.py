@@ -32,7 +32,7 @@ class Residuals(NamedTuple):
         maps_um: height maps that the model predicts, µm, one of shape (ny, nx) for each scan.
         residuals_nm: residuals of each scan, nm, after the terms of ``protocol`` are removed, with shape (ny,
             nx). The residuals are NaN at pixels that are not scored.
-        held_out: True if none of the scans was used to train the model that predicts it.
+        held_out: True if every scan is predicted by a model that was not trained on it.
     """
 
     model: str
@@ -58,8 +58,8 @@ class Pool(NamedTuple):
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
 
     def interval(self, values: Array, mine: Array) -> Interval:
-        """Return the confidence interval, from resampling prints, of the mean of ``values`` at the pixels
-        where ``mine`` is True. Both arrays have shape (n,).
+        """Return the confidence interval of the mean of ``values`` over the pixels at which ``mine`` is True.
+        The interval comes from resampling prints. Both arrays have shape (n,).
         """
         owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
         return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])
@@ -78,7 +78,7 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
         source: a frozen model (a folder or ``zoo:NAME``), or the result folder of ``litho-models benchmark``,
             whose cache contains predictions of held-out scans. Scans are left out if the store locks them or
             if they were locked when the frozen model was trained.
-        model: name of a model in the benchmark; by default the best model.
+        model: name of a model in the benchmark; by default the model with the smallest datum-free error.
 
     Raises:
         InputError: the folder contains neither a frozen model nor a benchmark; the benchmark belongs to

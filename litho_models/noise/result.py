@@ -35,8 +35,8 @@ class NoiseAnalysis(Result, extra="ignore"):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """Return the noise floor. The noise floor comes from repeated prints, if there are any; otherwise from
-    flat prints; and if there are no flat prints either, from the residuals of a model.
+    """Return the noise floor from the best available source: repeated prints, flat prints, or the residuals
+    of a model, in this order of preference.
     """
     if repeats is not None:
         return NoiseFloor(

@@ -57,24 +57,23 @@ class Tails:
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Return half the width of the central interval that contains a residual with the probability
-        ``level``. The unit is the scale of the distribution.
+        """Return half the width of the central interval in which a residual lies with the probability
+        ``level``. The width is stated in units of the scale of the distribution.
         """
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
-        """Return, for each pixel, whether its residual lies within the central interval that has the
-        probability ``level``. If the spread is calibrated, the share of residuals within their intervals is
-        ``level``.
+        """Return, for each pixel, whether its residual lies within the central interval for the probability
+        ``level``. For a calibrated spread, the share of pixels for which this is true equals ``level``.
         """
         return np.abs(residual) <= self.half_width(level) * scale
 
     def crps(self, residual: Array, scale: Array | float) -> Array:
         """Return the continuous ranked probability score in the unit of the residual.
 
-        The score is a generalisation of the absolute error to predictions that state a spread. As the scale
-        approaches 0, the score approaches the absolute value of the residual. For Student's t, the formula is
-        that of Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
+        The score generalises the absolute error to predictions that state a spread. As the scale approaches
+        0, the score approaches the absolute value of the residual. For Student's t, the formula is that of
+        Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
         z, n = residual / scale, self.freedom
         density, slope = student.pdf(z, n), z * (2 * student.cdf(z, n) - 1)
@@ -121,12 +120,12 @@ def sparsification_error(residual: Array, sigma: Array) -> float:
     Pixels are removed in two orders: those with the largest σ first, and those with the largest absolute
     residual ``|r|`` first. For each order, the mean ``|r|`` of the remaining pixels is a function of the
     share that is removed, from 0 to 1. AUSE is the area between the graphs of these two functions, divided by
-    the mean ``|r|`` of all pixels (Ilg et al. 2018, arXiv:1802.07095). All pixels with the same σ count with
-    their mean ``|r|``, so that their order does not matter.
+    the mean ``|r|`` of all pixels (Ilg et al. 2018, arXiv:1802.07095). For pixels with the same σ, ``|r|`` is
+    replaced by its mean over these pixels, so that their order does not matter.
 
     Args:
         residual, sigma: residual and stated standard deviation of each pixel, in the same unit, each of shape
-            (pixels,). At least one residual must not be zero.
+            (pixels,). At least one residual must differ from zero.
     """
     error = np.abs(residual)
     value, group = np.unique(sigma, return_inverse=True)

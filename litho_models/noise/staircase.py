@@ -16,8 +16,8 @@ from litho_models.noise.spread_scores import GAUSSIAN
 from litho_models.scan_terms.term import smooth_shapes
 from litho_models.scoring.statistics import rms
 
-# Smallest readability at which neighbouring steps can be told apart. With this readability, at most 2.5 % of
-# the pixels of each of the two treads lie beyond the middle between their heights.
+# Smallest readability at which single pixels of two neighbouring treads can be told apart. If the heights are
+# Gaussian, 2.5 % of the pixels of each tread are then nearer to the height of the other tread.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Pixels closer than this to an edge are not used. The distance is at least three standard deviations of the
 # printer's blur, so that the blurred edges are left out.
@@ -33,8 +33,8 @@ class Step(Record, extra="ignore"):
     Args:
         readability: height of the step divided by ``sigma_nm``, the standard deviation of single pixels on
             its two treads.
-        misread: share of the pixels on the step's two treads whose height is nearer to the height of the
-            other tread than to the height of their own tread.
+        misread: share of misread pixels, averaged over the two treads of the step. A pixel is misread if its
+            height is nearer to the mean of the other tread than to the mean of its own tread.
     """
 
     height_nm: float
@@ -50,7 +50,7 @@ class StepPrint(Record, extra="ignore"):
     Args:
         tread_sigma_nm: rms deviation of the height within the treads, after one tilt common to all treads is
             removed.
-        tread_mae_nm: mean absolute deviation of the height from the median of its tread.
+        tread_mae_nm: mean absolute deviation of the pixels from the median height of their tread.
         resolvable_step_nm: smallest height of a step at which single pixels of its treads can be told apart:
             3.92 times ``tread_sigma_nm``.
     """
@@ -124,8 +124,8 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
 
     A piecewise-constant function is fitted to the profile of the staircase. At each position along the axis,
     the profile is the median of the heights along the line parallel to the edges. The fit minimises the
-    squared error plus a price for each edge. The price is the amount by which an edge between two treads
-    reduces the squared error if the treads have the narrowest width and their heights differ by half a level.
+    squared error plus a price for each edge. The price equals the amount by which a single edge reduces the
+    squared error if its two treads have the smallest width and their heights differ by half a level.
 
     A tilt along the axis would add edges, so the tilt is removed first. Columns or rows without a measured
     pixel are skipped.
@@ -183,10 +183,10 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float:
-    """Return the median slope of a profile between its edges, in µm per unit of ``position``. If a tilt of
-    the profile adds edges, they do no harm, because the profile between them still has the slope of the tilt.
-    Only the middle of each piece is used, because the blurred edges may reach far into a narrow tread. The
-    result is 0 for a profile of fewer than two pixels.
+    """Return the median slope of a profile between its edges, in µm per unit of ``position``. Edges that were
+    found only because the profile is tilted do no harm: between them, the profile still has the slope of the
+    tilt. Only the middle of each piece is used, because the blurred edges may reach far into a narrow tread.
+    The result is 0 for a profile of fewer than two pixels.
     """
     if len(profile) < 2:
         return 0.0
@@ -199,8 +199,8 @@ def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Return the range of columns of each tread, without a zone of ``guard_px`` pixels along each of its two
-    edges. Each zone is at most a third as wide as the tread.
+    """Return the range of columns of each tread. On both sides, ``guard_px`` columns are left out, but at
+    most a third of the tread.
     """
     ends = pairwise([0, *edges_px, shape[1]])
     insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]

@@ -27,8 +27,7 @@ class SurfaceNoise(Record, extra="ignore"):
         background: background that was removed: the mean height (``offset``) or a polynomial of second degree
             (``quadratic``).
         sigma_nm: root-mean-square deviation (Sq).
-        sigma_uncertainty_nm: standard uncertainty of ``sigma_nm``, which follows from
-            ``independent_heights``.
+        sigma_uncertainty_nm: standard uncertainty of ``sigma_nm``, computed from ``independent_heights``.
         mae_nm: mean absolute deviation from the median. No distribution is assumed.
         independent_heights: number of independent heights in the field: the number of pixels divided by the
             sum of the squared autocorrelation.
@@ -95,14 +94,14 @@ def without_background(height_um: np.ndarray, background: Background) -> np.ndar
 
 
 def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:
-    """Compute the roughness that a print adds, by subtracting the squared roughness of the substrate from the
-    squared roughness of the flat print. The subtraction assumes that the roughness of the substrate and the
-    noise of the microscope are independent of the roughness of the print.
+    """Compute the roughness that a print adds: the root of the squared roughness of the flat print minus the
+    mean squared roughness of the substrates. The subtraction assumes that the roughness of the substrate and
+    the noise of the microscope are independent of the roughness of the print.
 
     Args:
         flat: roughness of the flat print.
-        substrates: roughness of one or more substrates, computed after the same kind of background is
-            removed.
+        substrates: roughness of one or more substrates, after the same kind of background was removed as from
+            the flat print.
     """
     square = flat.sigma_nm**2 - np.mean([one.sigma_nm**2 for one in substrates])
     if square <= 0:

@@ -21,8 +21,9 @@ class Period(Record, extra="ignore"):
 
     Args:
         period_um: distance at which the lines repeat, µm.
-        share: fraction of the sum of squares of the line means that this period accounts for.
-        p: probability that a smooth spectrum has a peak at least this high at any frequency.
+        share: fraction of the sum of squares of the line means that is due to this period.
+        p: p value of the peak, i.e. the probability that random line means with a smooth spectrum have a peak
+            at least this significant at some frequency.
         amplitude_nm: amplitude of the oscillation with this period, as root mean square over the surfaces.
         coherence: 1 if the lines have the same phase on all surfaces. The phase is counted from the first
             pixel of each array.
@@ -57,7 +58,8 @@ class Texture(Record):
     Args:
         angle_deg: direction of the lines in degrees; 0 is along x, and positive angles turn from x to y.
         strength: directional strength; 0 if all directions are alike, 1 if all lines have one direction.
-        isotropic_p: probability that an isotropic surface has at least this strength.
+        isotropic_p: p value of the direction, i.e. the probability that an isotropic surface has at least
+            this ``strength``.
         lines: results for the lines along x, then for the lines along y.
     """
 
@@ -117,8 +119,8 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
 
 
 def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
-    """Return the mean of each line. A line without measured pixels gets the value zero, which is the mean of
-    the surface, because the mean of all heights was subtracted before.
+    """Return the mean of each line. ``height_um`` must have zero mean. A line without measured pixels gets
+    this mean, i.e. zero.
     """
     measured = np.isfinite(height_um)
     return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)

@@ -1,8 +1,8 @@
 """Fit σ(x), the spread of a residual at each pixel. The logarithm of the spread is modelled as a linear
 function of covariates, which describe the layout at the pixel and the position of the pixel.
 
-The model of the height is fitted first and then kept fixed. Then the scale s of the residuals on held-out
-scans is fitted as ln s² = X β by maximum likelihood, where the residuals follow Student's t distribution.
+The model of the height is fitted first and then kept fixed. Then the scale s of the residuals of this model
+is fitted as ln s² = X β by maximum likelihood. The residuals are assumed to follow Student's t distribution.
 Because the fit has these two stages, a wide spread cannot hide errors of the predicted height (compare
 Seitzer et al. 2022, arXiv:2203.09168). Only a few covariates are used, because some tens of scans do not
 determine more coefficients.
@@ -34,7 +34,8 @@ COVARIATES = (
 # Numbers of degrees of freedom of Student's t distribution that are tried. The smallest gives much heavier
 # tails than residuals of prints have, and the largest gives a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
-# Standard deviation of the optical spot. The layout is blurred by it before its slope is computed.
+# Standard deviation of the optical spot. The layout is blurred by this spot before the slope of the layout is
+# computed.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
 # Largest change of ln s² in one step of the fit, which keeps exp() finite. The limit is twice the largest
@@ -64,7 +65,7 @@ class VarianceModel(Record):
 
 
 def place_maps(scan: PrintedScan) -> dict[str, Array]:
-    """Return, for each name in ``PLACES``, a map of its values at the pixels of a scan, of shape (ny, nx)."""
+    """For each quantity in ``PLACES``, return a map over the pixels of a scan, of shape (ny, nx)."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
     changes = maximum_filter(scan.mask_level, 3) != minimum_filter(scan.mask_level, 3)
@@ -98,8 +99,8 @@ def layout_slope(scan: PrintedScan) -> Array:
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
-    """Fit the scale of the residuals (β in ln s² = X β) and the shape of their distribution by maximum
-    likelihood. Return β and the shape.
+    """Fit the residuals by maximum likelihood. Return the coefficients β of their scale s (ln s² = X β) and
+    the shape of their distribution.
     """
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
