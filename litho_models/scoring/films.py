@@ -22,8 +22,8 @@ FILMS_TEXT = (
 
 
 class FilmErrors(NamedTuple):
-    """The errors of a predicted film. ``area_error_percent`` is the error of the predicted area, relative to
-    the measured area. It is None if the measured area is zero. The other fields count features.
+    """The errors of a predicted film. ``area_error_percent`` is the absolute error of the predicted area, in
+    percent of the measured area, or None if the measured area is zero. The other fields count features.
     """
 
     area_error_percent: float | None
@@ -66,9 +66,9 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """Find the connected parts of two masks. For each part of a mask that is large enough, count the parts of
-    the other mask that it touches. Return the counts for the parts of the first mask, and the counts for the
-    parts of the second mask.
+    """Find the connected parts of two masks, and use those with at least four pixels. For each part of one
+    mask, count the parts of the other mask that it overlaps. Return the counts for the parts of the first
+    mask, and the counts for the parts of the second mask.
     """
     from scipy.ndimage import label
 
@@ -81,8 +81,8 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
         [np.bincount(own[kept], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
         for kept in (slice(None), real)
     )
-    # If a part touches only parts that are smaller than the size limit, it counts as having a partner, but
-    # not as merging several parts.
+    # If a part overlaps only parts that are smaller than the size limit, its count is 1. It then has a
+    # partner, but does not merge several parts.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

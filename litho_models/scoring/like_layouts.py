@@ -1,10 +1,10 @@
 """Separate noise from errors of a model by comparing residuals at pixels whose surroundings in the layout are
 similar (gamma test).
 
-The part that residuals in similar surroundings have in common could still be learned by a model of the
-layout. The differences between such residuals are noise (Stefánsson, Končar and Jones 1997,
-doi:10.1007/BF01413858). Each pixel is compared with pixels of other scans. The datum, the gain and the bow of
-a single scan therefore count as noise.
+What residuals in similar surroundings have in common is an error of the model, because another model could
+predict it from the layout. The differences between such residuals are noise (Stefánsson, Končar and Jones
+1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of other scans. The datum, the gain and the
+bow of a single scan therefore count as noise.
 """
 
 from collections.abc import Sequence
@@ -42,11 +42,12 @@ class LikePixels(NamedTuple):
         """Return an estimate of the noise variance at each pixel of the sample, and the squared residual
         there. Both arrays have shape (n,).
 
-        The residual r₀ of a pixel and the residuals r₁ ... r_m of its partners are noise plus a misfit that
-        is the same for similar surroundings. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k is therefore the
-        variance of the noise in r₀ alone, whatever the noise of the partners. Half the squared difference of
-        two residuals would be a simpler estimate. But it would be too small for pixels with rare
-        surroundings, because such pixels are rougher than their partners.
+        Let r₀ be the residual of a pixel, and r₁ ... r_m the residuals of its partners. Each of them is the
+        sum of its own noise and a misfit, which is the same for all of them because their surroundings are
+        similar. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k therefore estimates the variance of the noise
+        in r₀, however large the noise of the partners is. Half the squared difference of two residuals would
+        be a simpler estimate, but too small for pixels with rare surroundings, because such pixels are
+        rougher than their partners.
 
         Args:
             residuals: one residual map per scan, of shape (ny, nx). Both results have the squared unit of
@@ -68,7 +69,7 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
     compared, because the dose changes the height even if the layouts are equal.
 
     Args:
-        scans: scans to compare. The result is None if fewer than three of them have the same dose, or if the
+        scans: scans to compare. The result is None if no dose is common to at least three scans, or if the
             layouts are flat.
         scored: for each scan, a mask of shape (ny, nx) that is True at the pixels that may be drawn.
         seed: determines which pixels are drawn.

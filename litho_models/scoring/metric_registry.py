@@ -80,7 +80,7 @@ _MEASUREMENTS = [
 def register_metric(
     name: str, unit: str, function: MetricFunction, explanation: str, *, over_scans: Summary = "mean"
 ) -> Metric:
-    """Register a metric. Every later evaluation and benchmark of this process then computes it.
+    """Register a metric. Until the Python process ends, every evaluation and every benchmark computes it.
 
     ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan`` and two maps in µm, of shape
     (ny, nx). The first map is the predicted height. The second map is the measured minus the predicted
@@ -95,12 +95,12 @@ def register_metric(
     Results then contain ``metrics: {"worst_pixel_nm": …}`` for each scan and for the model.
 
     Args:
-        name: name of the metric, which consists of letters, digits and underscores.
-        unit: unit of the metric, with the same characters; ``1`` for a metric without a unit.
+        name: name of the metric, which must be a Python identifier (letters, digits and underscores).
+        unit: unit of the metric, which must also be a Python identifier; ``1`` for a metric without a unit.
         function: function that computes the metric of one scan, as described above.
         explanation: sentence that explains the metric in the report.
-        over_scans: ``mean`` or ``sum``: how the values of single scans are combined to the metric of a model.
-            Values that are None are left out.
+        over_scans: ``mean`` or ``sum``. The metric of a model is this mean or this sum of the values of
+            single scans. Values that are None are left out.
 
     Raises:
         InputError: the name or the unit is not an identifier, the name is already taken, or ``over_scans`` is
@@ -168,7 +168,7 @@ def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
 
 
 def _as_fields(values: Mapping[str, float | None]) -> dict[str, Any]:
-    """Arrange metrics as the fields of ``MetricValues``. Metrics that have no field there are put under
+    """Arrange metrics as the fields of ``MetricValues``. A metric without a field of its own is put under
     ``metrics``.
     """
     own = {key: value for key, value in values.items() if key in ScanRow.model_fields}

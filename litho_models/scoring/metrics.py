@@ -19,11 +19,11 @@ INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """A straight line fitted to a scan, measured height = slope · predicted height + intercept, and the
+    """The line "measured height = slope · predicted height + intercept" that is fitted to a scan, and the
     standard error of its slope.
 
-    A value is None if it cannot be computed. A constant prediction has no slope, and with only one block
-    there is no standard error.
+    ``slope`` is None for a constant prediction. ``slope_error`` is None for a constant prediction, and if
+    there is only one block.
     """
 
     slope: float | None
@@ -34,8 +34,8 @@ class PrintGain(NamedTuple):
 def print_gain(
     height_um: Array, prediction_um: Array, used: Array, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
-    """Fit a straight line by least squares to measured against predicted heights at the selected pixels of a
-    scan.
+    """Fit the measured height of a scan by a straight line in the predicted height, by least squares over the
+    selected pixels.
 
     Residuals of neighbouring pixels are correlated, so the standard error is computed from blocks of pixels
     (Liang and Zeger 1986). In each block, the products of residual and regressor (predicted height) are
@@ -63,9 +63,9 @@ def print_gain(
 
 
 def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
-    """Compute the errors of a prediction on one scan, over the pixels that ``cross_fit`` selects for scoring.
-    Measured and predicted height have shape (ny, nx) and are in µm; ``free`` is the result of ``cross_fit``
-    for them.
+    """Compute the errors of a prediction on one scan. Measured and predicted height are in µm and have shape
+    (ny, nx). ``free`` is the result of ``cross_fit`` for these two maps. The scored pixels are those at which
+    ``free.residual_um`` is not NaN.
 
     The gain and the offset of the print are the slope and the intercept that ``print_gain`` fits.
 
@@ -99,9 +99,8 @@ def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtoco
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Return the error of a model after an offset is fitted to each scan (datum-free error with the policy
-    ``offset``), nm, averaged over scans. ``heights_um`` contains the predicted height of each scan, µm, of
-    shape (ny, nx).
+    """Return the datum-free error of a model, nm, averaged over scans. The policy is ``offset``: an offset is
+    fitted to each scan. ``heights_um`` contains the predicted height of each scan, µm, of shape (ny, nx).
     """
     protocol = NuisanceProtocol()
     residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))

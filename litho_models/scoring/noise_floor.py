@@ -28,8 +28,8 @@ class PolicyFloor(Record):
     """The noise floor for one nuisance policy (set of per-scan terms), nm, with 95 % confidence intervals
     from resampling prints.
 
-    ``k`` is the number of terms that are fitted to each scan; with line offsets, it is their effective
-    number. The intervals are None if there are fewer than six prints.
+    ``k`` is the number of terms that are fitted to each scan. For a policy with line offsets, ``k`` is the
+    effective number of terms. The intervals are None if there are fewer than six prints.
     """
 
     policy: Policy
@@ -41,13 +41,13 @@ class PolicyFloor(Record):
 
 
 class NoiseFloor(Record):
-    """The noise floor: the error that noise alone causes, nm. ``kind`` says how it was estimated, and
-    ``source`` says from what.
+    """The noise floor: the error that noise alone causes, nm. ``kind`` says how the floor was estimated, and
+    ``source`` names the data.
 
     ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error for the
-    policy ``offset``, with which an offset is fitted to each scan. ``by_policy`` contains the floors for each
-    policy. It is empty in older result files, or if only the floor for the policy ``offset`` is known. The
-    kinds ``lower-bound`` and ``literature`` occur only in older files.
+    policy ``offset``, i.e. after an offset is fitted to each scan. ``by_policy`` contains the floors for each
+    policy. This list is empty in older result files, and if only the floor for the policy ``offset`` is
+    known. The kinds ``lower-bound`` and ``literature`` occur only in older files.
     """
 
     mae_nm: float | None
@@ -91,7 +91,7 @@ def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
 
     Args:
         dataset_name: name of the dataset for which errors are reported.
-        analysis: path of a ``noise.json`` or of its folder. It must belong to this dataset, or to single
+        analysis: path of a ``noise.json`` or of its folder. The analysis must be about this dataset, or about
             scans that belong to no dataset.
 
     Raises:
@@ -112,8 +112,8 @@ def estimated_floor(
     blocks: Blocks | None = None,
     seed: int = 0,
 ) -> NoiseFloor:
-    """Estimate an upper limit of the noise floor for every policy, from the predictions of a model for
-    held-out scans.
+    """Estimate an upper limit of the noise floor for every policy. The estimate uses the predictions of a
+    model for held-out scans.
 
     Args:
         model: name of the model, which is stated in the field ``source`` of the result.
@@ -152,13 +152,13 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """Estimate an upper limit of the noise floor from the residuals of a model on held-out scans.
 
-    On a random sample of pixels, ``LikePixels`` estimates which fraction of the squared error is noise, i.e.
-    not common to pixels with similar surroundings. The floor is the error over all scored pixels times the
-    square root of this fraction. For the mean absolute error, this assumes that noise and residual have the
-    same ratio of mean absolute value to standard deviation. This holds for noise of any distribution if
-    nearly all of the residual is noise. If half of the squared error came from a misfit with another
-    distribution (a Laplace distribution beside Gaussian noise, or the reverse), the floor would be wrong by
-    up to 6 %.
+    ``LikePixels`` estimates the noise from differences between pixels with similar surroundings. From a
+    random sample of pixels, it gives the fraction of the squared error that is noise. The floor is the error
+    over all scored pixels times the square root of this fraction. For the mean absolute error, this assumes
+    that noise and residual have the same ratio of mean absolute value to standard deviation. The assumption
+    is true if nearly all of the residual is noise, whatever the distribution of the noise. An unfavourable
+    case is Gaussian noise with a misfit that has a Laplace distribution, or the reverse. If half of the
+    squared error came from such a misfit, the floor would be wrong by up to 6 %.
 
     Args:
         model: name of the model, which is stated in the field ``source`` of the result.
@@ -167,8 +167,8 @@ def floor_of_residuals(
             ``offset`` must be among the keys.
         seed: decides which pixels are drawn.
     """
-    # The scans are sorted by id, so that the same pixels are drawn whatever the order in which the scans are
-    # given.
+    # The scans are sorted by id, so that the pixels that are drawn do not depend on the order of the argument
+    # ``scans``.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)
     scans = [scans[number] for number in order]
     scored = [np.isfinite(freed["offset"][number].residual_um) for number in order]

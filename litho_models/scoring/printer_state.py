@@ -22,13 +22,12 @@ class ScanFigures(Record):
     """Values that compare a scan with the prediction of a model, after the offset, tilt and bow of the scan
     are removed.
 
-    ``gain`` is the slope of the measured height as a function of the predicted height. ``gain_error`` is its
-    standard error, which is computed from blocks of pixels and is None if there is only one block (see
-    ``print_gain``). ``error_nm`` is the mean absolute error for the policy ``full``, i.e. after 7 terms
-    including the gain are fitted to the scan. The pixels to which these terms are fitted are not those on
-    which the error is scored. ``order`` is the position of the scan in printing order. ``relief_nm`` and
-    ``steepness`` are the standard deviation and the rms slope of the predicted height, which characterise the
-    layout. ``held_out`` is True if the model was not trained on the scan.
+    ``gain`` is the slope of the measured height as a function of the predicted height. ``gain_error`` is the
+    standard error of the gain (see ``print_gain``). ``error_nm`` is the mean absolute error for the policy
+    ``full``, i.e. after 7 terms including the gain are fitted to the scan. The terms are not fitted to the
+    pixels on which the error is scored. ``order`` is the position of the scan in printing order.
+    ``relief_nm`` and ``steepness`` are the standard deviation and the rms slope of the predicted height,
+    which characterise the layout. ``held_out`` is True if the model was not trained on the scan.
     """
 
     scan: str

@@ -92,8 +92,8 @@ class ScanErrors(Record, extra="ignore"):
 
     ``mae_abs_nm`` and ``bias_nm`` (measured minus predicted) are computed with nothing fitted to the scan.
     The errors with ``datum_free`` in their name are computed after per-scan terms are removed. These terms
-    are fitted to other pixels than the scored ones. ``slope`` and ``intercept_nm`` are the gain and the
-    offset of the measured height relative to the predicted height (see ``print_gain``).
+    are not fitted to the scored pixels. ``slope`` and ``intercept_nm`` are the gain and the offset of the
+    measured height relative to the predicted height (see ``print_gain``).
     """
 
     pixels: int
@@ -120,10 +120,11 @@ class ModelScores(MetricValues, extra="ignore"):
     """All scores of one model. Errors are means over scans, counts are sums over scans, and confidence
     intervals come from resampling scans.
 
-    ``without_background`` contains the same errors as ``by_policy``, but computed without the background of
-    the protocol. It is empty if the protocol has no background. If the background is smooth (``training``),
-    only the policies without smooth terms such as tilt are listed. ``phase_rms_waves`` is the RMS phase
-    error, in waves, of light that passes through the print.
+    ``by_policy`` and ``without_background`` contain the mean absolute error for each policy: with the
+    background of the protocol, and without it. ``without_background`` is empty if the protocol has no
+    background. If the background is smooth (``training``), ``without_background`` lists only policies without
+    tilt and bow, because these terms would absorb the background. ``phase_rms_waves`` is the RMS phase error,
+    in waves, of light that passes through the print.
     """
 
     model: str
@@ -164,12 +165,12 @@ class ModelScores(MetricValues, extra="ignore"):
 
 
 class Paired(Record):
-    """The comparison of two models. ``mean_nm`` is the leading error of the first model minus that of the
-    second model, averaged over scans. A negative mean favours the first model. ``first_better`` counts the
-    scans in which the first model is better.
+    """The comparison of two models. ``mean_nm`` is the leading error (see ``ModelScores``) of the first model
+    minus the leading error of the second model, averaged over scans. If it is negative, the first model is
+    better. ``first_better`` counts the scans in which the first model is better.
 
-    ``over_prints`` is the same comparison, but with prints instead of scans as independent units. It is None
-    if there is only one print, and in older result files.
+    ``over_prints`` is the same comparison with prints instead of scans as independent units. ``over_prints``
+    is None if there is only one print, and in older result files.
     """
 
     first: str
@@ -183,8 +184,8 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the leading errors of two models on the same scans. The scans are paired by id, because each
-    result lists its scans in the order of its folds, which may differ.
+    """Compare the leading errors of two models on the same scans. The scans are paired by id, because the two
+    models may list them in different orders.
 
     Raises:
         InputError: the two models were scored on different scans.

@@ -1,9 +1,9 @@
 """Compare the shapes in a measured map with those in a predicted map, by the structural similarity of the
 maps and by the positions of the edges.
 
-The edges are contours of both maps at the heights halfway between nominal levels. Marching squares finds them
-by linear interpolation between pixels. The maps are not smoothed, so the roughness of the measured contours
-is part of the error.
+The edges of a map are its contours at the heights halfway between nominal levels. For films, there is one
+contour, at half the height of the film. Marching squares finds the contours by linear interpolation between
+pixels. The maps are not smoothed, so the roughness of the measured contours is part of the error.
 """
 
 from typing import NamedTuple
@@ -36,14 +36,14 @@ EDGES_TEXT = (
 
 
 class EdgePlacement(NamedTuple):
-    """The distances between measured and expected contours, and numbers of pieces of contours. The contours
-    are divided into pieces, each of which lies within one pixel.
+    """The distances between measured and expected contours, and the numbers of their pieces. Each contour is
+    divided into pieces that are at most as long as the diagonal of a pixel.
 
     A piece of a measured contour has a partner if an expected contour of the same height passes within the
     search distance, and if both maps rise to the same side of the contours. ``mean_nm`` and ``p95_nm`` are
-    the mean and the 95th percentile of the distances of the pieces with a partner; they are None if no piece
-    has one. ``matched`` and ``unmatched`` count the pieces with and without a partner. ``unmatched_expected``
-    counts the pieces of expected contours without a partner.
+    the mean and the 95th percentile of the distances from such pieces to their partners; both are None if no
+    piece has a partner. ``matched`` and ``unmatched`` count the pieces of measured contours with and without
+    a partner. ``unmatched_expected`` counts the pieces of expected contours without a partner.
     """
 
     mean_nm: float | None
@@ -69,8 +69,8 @@ def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -
     """Compare the measured edges of a scan with the predicted edges. The measured map without the per-scan
     terms is the prediction plus the residual.
 
-    If no edge of a film has a partner, the distances are set to the search distance, because the edges are at
-    least that far apart. If neither map has an edge, the distances are set to 0.
+    For films, ``mean_nm`` and ``p95_nm`` are set to the search distance if no edge has a partner, because
+    measured and predicted edges are at least that far apart. They are set to 0 if neither map has an edge.
     """
     measured_um = prediction_um + residual_um
     if scan.seen_by != "sem":

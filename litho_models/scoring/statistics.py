@@ -1,6 +1,7 @@
-"""Confidence intervals and tests whose units are scans or prints. The pixels of a scan are correlated, so
-whole scans are resampled, and sign-flip tests flip the sign of whole scans. If a dataset has several scans
-per print, these scans may share a day and a batch. In this case, prints are the units instead of scans.
+"""Confidence intervals and tests that treat scans or prints as independent units. The pixels of a scan are
+correlated, so whole scans are resampled, and a sign-flip test flips one sign per scan. If a dataset has
+several scans per print, these scans may share a day and a batch. In this case, prints are the units instead
+of scans.
 """
 
 from collections.abc import Hashable, Sequence
@@ -23,9 +24,9 @@ PERMUTATIONS = 1999
 # The quantiles at the ends of a 95 % interval. They are written in this way because 0.025 would differ in its
 # last bits, which would change published results.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
-# Largest number of scans for which a test uses every combination of signs, in screening and in a comparison
-# of two models. Screening tests all candidates at once and therefore needs more memory. The limit for
-# screening is one scan lower, which halves the table of signs.
+# Largest number of scans for which a test uses every combination of signs: the first value is for screening,
+# and the second for a comparison of two models. Screening tests all candidates at once and therefore needs
+# more memory. The limit for screening is one scan lower, which halves the table of signs.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
 # The combinations of signs include the observed signs. With this factor, rounding errors cannot exclude the
 # observed signs from the combinations that are counted.
@@ -130,8 +131,8 @@ def smallest_flip_p(count: int) -> float:
 
 
 class OverUnits(Record):
-    """The confidence interval and the p value of the mean of a difference over scans. The independent units
-    are scans or prints.
+    """The confidence interval and the p value of a difference that is averaged over scans. The independent
+    units are scans or prints.
 
     ``count`` is the number of units, and ``positive`` is the number of units with a positive difference.
     ``ci95_nm`` is a bootstrap interval, or None if there are fewer than ``FEWEST_FOR_INTERVAL`` units. ``p``
@@ -150,8 +151,9 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Test whether the mean of a difference could differ from zero by chance. The difference is given for
-    each scan. The independent units are scans or, if ``groups`` states the print of each scan, prints.
+    """Test whether the mean of a difference differs from zero by more than chance. ``differences_nm`` has one
+    value per scan. The independent units are scans. If ``groups`` states the print of each scan, the
+    independent units are prints.
 
     Raises:
         InputError: no difference is given.
@@ -194,7 +196,7 @@ class ByPrint(Record):
 
 
 def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrint | None:
-    """Test whether scans of one print are more similar than scans of different prints.
+    """Test whether scans of the same print are more alike than scans of different prints.
 
     Args:
         values: estimates for each scan, of shape (scans,) or (scans, k). Each column is divided by its

@@ -28,8 +28,8 @@ class LevelError(Record):
 
 
 class TransferCurves(Record, extra="ignore"):
-    """A comparison of the spectra of the predicted height H and the measured height Z, along x and along y.
-    For each frequency, it contains the gain |H·Z*| / |Z|² and the coherence γ².
+    """The spectrum of the predicted height H compared with the spectrum of the measured height Z, along x and
+    along y: for each frequency, the gain |H·Z*| / |Z|² and the coherence γ².
 
     ``error_psd_x`` and ``error_psd_y`` are the one-sided power spectral density of the error, nm² per
     cycle/µm. The mean of each line is removed first.
@@ -94,15 +94,16 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 def _band_powers(error: Array, prediction: Array, usable: Array, pitch_um: float, edges: Array) -> Array:
     """Compute sums over frequency bands. The result has shape (6, bands). Its rows are the real and the
-    imaginary part of the cross power, the power of the measurement, the power of the prediction, the error
-    density, and the number of terms in its sum. Each value is a sum over all lines and over the frequencies
-    of one band.
+    imaginary part of the cross power, the power of the measurement, the power of the prediction, the power
+    spectral density of the error, and the number of terms in the sum of this density. Each value is a sum
+    over all lines and over the frequencies of one band.
 
-    The error density is one-sided, in µm² per cycle/µm. Its mean is the sum divided by the number of terms.
+    The power spectral density is one-sided, in µm² per cycle/µm. Its sum divided by the number of terms is
+    its mean.
 
     ``error`` is measured minus predicted height, and 0 at pixels that are not usable. The power of the error
-    in a line is therefore proportional to the measured share of the line. The power of the prediction and the
-    number of terms are multiplied by the same share, so that unmeasured pixels have no effect.
+    in a line is therefore proportional to the share of the line that is usable. The power of the prediction
+    and the number of terms are multiplied by the same share, so that unusable pixels do not bias the results.
     """
     window = np.hanning(error.shape[1])
     share = usable @ window**2 / np.sum(window**2)
