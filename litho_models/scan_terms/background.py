@@ -37,8 +37,9 @@ class ScanPart(PrintedScan):
 
 
 class Background(Record):
-    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². They are fitted to all
-    training scans together, and ``scans`` is the number of these scans or parts of scans.
+    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². The coefficients are
+    fitted to the training scans together. ``scans`` is the number of these scans; a part of a scan counts as
+    one.
 
     x and y run from -1 to 1 over a whole field whose size (y, x) is ``field_um``. Each term has zero mean, so
     a background does not change the datum.
@@ -71,8 +72,8 @@ def field_um(scan: PrintedScan) -> tuple[float, float]:
 
 
 def on_field(scan: PrintedScan, maps: Callable[[tuple[int, int]], FloatMap]) -> FloatMap:
-    """Return the values of maps of the whole field at the pixels of a scan, which may be a part of the field.
-    ``maps`` is a function that returns the maps for a given shape (ny, nx) of the field; their last two axes
+    """Evaluate maps of the whole field at the pixels of a scan, which may be a part of the field. ``maps`` is
+    a function that returns the maps for a given shape (ny, nx) of the field. The last two axes of the maps
     are y and x.
     """
     if not isinstance(scan, ScanPart):
@@ -94,11 +95,11 @@ def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
     """Learn the smooth background that all scans show in addition to the heights that a model predicts.
 
-    All terms of policy ``full`` (offset, gain, tilt and bow) are fitted to the valid pixels of each scan. The
-    background is the smooth surface over the whole field that best fits, at these pixels, the tilts and bows
-    of all scans; each scan has a free offset. If the scans are whole and fully measured, the coefficients of
-    this surface are the means of the coefficients of the scans. If the fields of the scans differ in size,
-    only the scans with the most frequent field size are used.
+    All terms of policy ``full`` (offset, gain, tilt and bow) are fitted to the valid pixels of each scan. A
+    smooth surface over the whole field is then fitted to the tilts and bows of all scans at these pixels,
+    with a free offset for each scan. This surface is the background. If the scans are whole and fully
+    measured, the coefficients of this surface are the means of the coefficients of the scans. If the fields
+    of the scans differ in size, only the scans with the most frequent field size are used.
 
     Args:
         scans: training scans.

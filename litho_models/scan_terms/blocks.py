@@ -1,10 +1,10 @@
 """Divide the pixels of a scan into pixels to which terms are fitted and pixels that are scored.
 
-Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are therefore fitted
-to one half of a checkerboard and subtracted from the other half. The offset of a line needs more separation,
-because it is estimated from few pixels, and because the roughness of neighbouring pixels is correlated.
-(Along x, the correlation is still 0.2 at a distance of 32 px.) Line offsets are therefore fitted on the other
-side of the scan, beyond a gap.
+If terms were fitted to the scored pixels, a model would look better than it is. Smooth terms are therefore
+fitted to one half of a checkerboard and subtracted from the other half. The offset of a line needs more
+separation, because it is estimated from few pixels, and because the roughness of neighbouring pixels is
+correlated. (Along x, the correlation is still 0.2 at a distance of 32 px.) If a line is scored on one side of
+the scan, its offset is therefore fitted on the other side, beyond a gap.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Blocks(NamedTuple):
 
     Attributes:
         block_px: side length of a block of the checkerboard, in pixels.
-        buffer_px: distance that separates fitted from scored pixels. Every fitted pixel is farther than this
-            from every scored pixel. The default is about one correlation length of the residuals of measured
-            prints. At a distance of 5 px, the correlation of these residuals is 0.5.
+        buffer_px: distance between fitted and scored pixels. Every fitted pixel is more than ``buffer_px``
+            away from every scored pixel. The default is about one correlation length of the residuals of
+            measured prints. At a distance of 5 px, the correlation of these residuals is 0.5.
         line_gap_px: for line offsets, distance along the line between fitted and scored pixels.
         seed: seed of the random shift of the checkerboard's origin.
     """
@@ -43,9 +43,9 @@ class Blocks(NamedTuple):
 
 
 class Half(NamedTuple):
-    """One of the two halves into which the checkerboard divides a scan, given by two masks of shape (ny, nx).
-    Terms are fitted to the pixels of the mask ``calibrate`` and subtracted from the pixels of the mask
-    ``score``.
+    """Two masks of shape (ny, nx). With them, one colour of the checkerboard is scored, and terms are fitted
+    to the other colour. ``score`` is True at all pixels of the scored colour. ``calibrate`` is True at those
+    pixels of the other colour that are far enough from the scored pixels.
     """
 
     calibrate: BoolMap
@@ -66,7 +66,7 @@ class Cell(NamedTuple):
 
 @lru_cache(maxsize=8)
 def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
-    """Divide the scan into the two halves of a checkerboard of square blocks.
+    """Divide the scan into a checkerboard of square blocks, and return the masks for each of its two colours.
 
     Raises:
         InputError: the blocks are too small for the buffer.
@@ -85,7 +85,8 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:
     """Cut the scan into parts, across its lines. If all lines run along the same axis, the parts are two
-    halves. If there are lines along both axes, the parts are four quadrants.
+    halves. If there are lines along both axes, the parts are four quadrants. Without lines, there is one
+    part, the whole scan.
 
     Args:
         shape: shape (ny, nx) of the scan.

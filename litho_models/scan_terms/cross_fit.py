@@ -1,8 +1,8 @@
-"""Subtract from a scan its per-scan terms, such as datum and bow, which are fitted to pixels that are not
-scored.
+"""Fit the per-scan terms of a scan, such as datum and bow, to pixels that are not scored. Subtract the terms
+from the scored pixels.
 
-For example, the datum and the bow of a scan contain no information about the printer, so the error of a model
-may be stated after they have been subtracted. In this project, ``cross_fit`` computes all errors that are
+The datum and the bow of a scan contain no information about the printer, so the error of a model may be
+stated after such terms have been subtracted. In this project, ``cross_fit`` computes all errors that are
 stated in this way.
 """
 
@@ -120,8 +120,8 @@ def fitted_terms(
 
 
 def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, terms: Terms) -> FloatMap:
-    """Return the measured minus the predicted height after the terms fitted by ``fitted_terms`` are
-    subtracted, µm. The result has shape (ny, nx) and is 0 at unused pixels.
+    """Return the measured height minus the predicted height minus the terms that ``fitted_terms`` fits, µm.
+    The result has shape (ny, nx) and is 0 at unused pixels.
     """
     _, own = fitted_terms(height_um, prediction_um, used, terms)
     return np.where(used, height_um - prediction_um - own, 0.0)

@@ -57,12 +57,12 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     labels, one per scan, in the order of ``scans``.
 
     Groupings are derived from the dataset card, which states the print, tip, direction and rotation of each
-    scan and may state further groups. They are also derived from the scan ids: each position at which the
-    character varies gives a grouping by this character. With ``by_order``, groupings are also derived from
-    the printing order. Such a grouping has two groups: the scans before and the scans after a position at
-    which something may have changed. A grouping that is not derived from the printing order must have at
-    least two labels (except ``all``), and at least half of its labels must have two or more scans. If two
-    groupings divide the scans in the same way, only the first is used.
+    scan and may state further groups. If all scan ids have the same length, groupings are also derived from
+    the ids: for each position in the id, scans with the same character at this position form a group. With
+    ``by_order``, groupings are also derived from the printing order. Such a grouping has two groups: the
+    scans before and the scans after a position at which something may have changed. Any other grouping,
+    except ``all``, must have at least two labels, and at least half of its labels must have two or more
+    scans. If two groupings divide the scans in the same way, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -119,7 +119,7 @@ _ALIKE = 1e-7
 
 @dataclass(frozen=True)
 class Block:
-    """Columns whose strengths differ by the same grouping and have the same prior.
+    """Columns with the same grouping of their strengths and the same prior.
 
     Attributes:
         columns: indices of the columns in the inner products, counted from 1, because index 0 is the
@@ -155,9 +155,8 @@ class Products:
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the strengths that fit the scans with the given indices best. The result is a list with one
-        dictionary per block. It is keyed by label, and its values are arrays of strengths of shape
-        (columns,).
+        """Return the best-fitting strengths for the scans with the given indices. The result is a list with
+        one dictionary per block. Each dictionary maps a label to an array of strengths, of shape (columns,).
 
         Labels that do not occur among these scans are absent from the dictionaries.
         """
@@ -186,8 +185,8 @@ class Products:
         return left
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Return the cross-validated mean squared residual of each scan: the strengths are fitted to the
-        scans outside the fold of this scan. The result has shape (scans,).
+        """Return the cross-validated mean squared residual of each scan. For each scan, the strengths are
+        fitted to the scans in the other folds. The result has shape (scans,).
 
         Args:
             fold_of: number of the fold of each scan, of shape (scans,).

@@ -23,9 +23,8 @@ def scan_line_index(
         shape: shape (ny, nx) of the layout.
         scan_to_layout: matrix of shape (3, 3) that maps homogeneous coordinates (x_um, y_um, 1) of the scan
             to those of the layout.
-        pitch_um: size of a layout pixel. The distance between scan lines is assumed to be the same.
-        bend_um: bend of the scan. It is not contained in ``scan_to_layout``. None means that the scan is not
-            bent.
+        pitch_um: size of a layout pixel. The distance between scan lines is assumed to equal this size.
+        bend_um: bend of the scan, which ``scan_to_layout`` does not contain; None if the scan is not bent.
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
@@ -53,11 +52,11 @@ def shrunk_line_offsets(
     """Estimate the height offset s_i of each line. The offsets are treated as random effects with s_i ~ N(0,
     v), and their best linear unbiased prediction (BLUP) is returned.
 
-    Each line is divided into blocks. The scatter of the block means within the lines gives the noise variance
-    of a line mean, and this estimate allows for correlation of the noise along the line. The estimate of v is
-    the variance of the line means minus this noise variance. If all lines have the same number of blocks,
-    this moment estimate equals the restricted maximum likelihood estimate (REML). The offset of a line
-    without used pixels is 0.
+    Each line is divided into blocks. The noise variance of a line mean is estimated from the scatter of the
+    block means within the lines. This estimate holds even if the noise is correlated along the line. The
+    estimate of v is the variance of the line means minus this noise variance. If all lines have the same
+    number of blocks, this moment estimate equals the restricted maximum likelihood estimate (REML). The
+    offset of a line without used pixels is 0.
 
     Args:
         residual_um: residual, µm, of shape (ny, nx).

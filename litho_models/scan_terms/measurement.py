@@ -1,10 +1,10 @@
-"""The measurement model. It describes the changes of the measured height map that the microscope, the
-registration and the levelling cause in the same way in several scans.
+"""The measurement model. It describes how the microscope, the registration and the levelling change the
+height map. Only changes that several scans have in common are included.
 
 In a scan, the image of the print is displaced by the uneven motion of the scanner, multiplied by a gain,
-levelled, and added to a background. The changes that all scans share, or that all scans of a group share, are
-learned from training scans and applied to predictions of other scans. Nothing is fitted to a scored scan. The
-measurement model is not part of the printer and is not used in a design.
+levelled, and added to a background. Some of these changes are the same in all scans or in all scans of a
+group. They are learned from training scans and applied to predictions of other scans. Nothing is fitted to a
+scored scan. The measurement model is not part of the printer and is not used in a design.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class SharedPart(Record):
             x and y up to the total ``degree``, where x and y run from -1 to 1 over the field. A gain is a
             single number, the relative change of the height.
         by: name of the grouping whose groups have separate coefficients.
-        coefficients: coefficients for each label of the grouping, in µm; the coefficient of a gain is
-            dimensionless. A part without coefficients changes nothing.
-        shrinking: weight that the fit gave to the prior that the coefficients are zero, stated as a number of
-            scans.
+        coefficients: coefficients for each label of the grouping, in µm. For a gain, there is one
+            dimensionless coefficient. A part without coefficients changes nothing.
+        shrinking: weight, in the fit, of the prior that the coefficients are zero. The weight is stated as a
+            number of scans.
     """
 
     what: Shared
@@ -120,8 +120,8 @@ class MeasurementModel(Record):
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
     def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
-        """Return the scan after subtracting the changes that this model makes to the predicted height.
-        ``prediction_um`` is the predicted height of the print, µm, of shape (ny, nx).
+        """Return the scan minus the changes that this model makes to the predicted height. ``prediction_um``
+        is the predicted height of the print, µm, of shape (ny, nx).
         """
         added = self.expected_um(scan, prediction_um) - prediction_um
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
@@ -130,7 +130,8 @@ class MeasurementModel(Record):
         """Return a model that contains only the differences between groups. To obtain them, the mean over all
         labels is subtracted from the coefficients of each part.
 
-        Gains are left out, because a difference in gain between prints may come from the printer.
+        The levelling and the parts that are the same in all scans are left out. Gains are left out, too,
+        because a difference in gain between prints may come from the printer.
         """
         kept = []
         for part in self.parts:
@@ -152,8 +153,8 @@ class MeasurementModel(Record):
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Apply the displacements among the given parts to a predicted height map; ignore parts of other kinds.
-    The height map and the result have shape (ny, nx) and are in µm.
+    """Displace a predicted height map by those of the given parts that are displacements. Ignore the other
+    parts. The height map and the result have shape (ny, nx) and are in µm.
     """
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]

@@ -1,7 +1,7 @@
-"""Learn the measurement model: choose which changes (parts) the scans share, and fit the coefficients of
-these parts.
+"""Learn the measurement model: choose its parts, which are changes that several scans have in common, and fit
+their coefficients.
 
-A part is, for example, a background or a displacement that all scans of a group have in common. Parts are
+A part is, for example, a background or a displacement that is the same in all scans of a group. Parts are
 chosen by cross-validation within the given scans.
 """
 
@@ -45,8 +45,8 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights to try for the prior that groups do not differ. A weight is stated as a number of scans. It is the
-# variance within groups divided by the variance between groups.
+# Weights to try for the prior that the coefficients of every group are zero. A weight is stated as a number
+# of scans. The ideal weight is the variance within groups divided by the variance between groups.
 _SHRINKING = (0.3, 1.0, 3.0)
 # A part is added only if the squared error on held-out scans falls by more than ``_LEAST_Z`` standard errors
 # of the decrease, and by more than the fraction ``_LEAST_SHARE`` of the squared error.
@@ -69,7 +69,8 @@ def learn_measurement(
     seed: int = 0,
     like: MeasurementModel | None = None,
 ) -> MeasurementModel:
-    """Learn the measurement model of the given scans, relative to the predicted heights of their prints.
+    """Learn the measurement model from the differences between the given scans and the predicted heights of
+    their prints.
 
     Parts are added one at a time, as long as each part lowers the cross-validated squared error by more than
     0.3 % and by more than half the standard error of this decrease. If the fields of the scans differ in
@@ -102,7 +103,7 @@ def learn_measurement(
 
 def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
     """Return, for each scan, the inner products between the residual and the columns (regressors) of all
-    parts that may be tried. The columns are linearised at the current measurement model.
+    parts that may be tried. The columns are computed by linearisation at the current measurement model.
     """
     grams = []
     for scan, prediction in pairs:
@@ -214,6 +215,8 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    """Return the number of the inner fold of each scan. A hash of the scan id assigns a scan to its fold."""
+    """Return the number of the inner fold of each scan. The scans are dealt to the folds in the order of a
+    hash of their ids.
+    """
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])

@@ -59,12 +59,11 @@ class NuisanceProtocol(Record):
     """The terms that are subtracted from scans before scoring, and the pixels to which they are fitted.
 
     ``k`` is the number of smooth terms per scan. It does not include the line offsets of policy
-    ``full+rows``. The effective number of line offsets depends on the prediction, so it is stated in
-    ``PolicyError.k``. ``background`` is ``training`` if the scored predictions include the smooth background
-    of the training scans, ``shared`` if they include the whole measurement model, and ``none`` if they
-    include neither. No part of the background is fitted to the scored scan. ``border_px`` is the number of
-    pixels that are left out at the edge of a scan; it is always zero. The other fields are those of
-    ``Blocks``.
+    ``full+rows``. ``PolicyError.k`` also counts the line offsets, whose effective number depends on the
+    prediction. ``background`` is ``training`` if the scored predictions include the smooth background of the
+    training scans, ``shared`` if they include the whole measurement model, and ``none`` if they include
+    neither. No part of the background is fitted to the scored scan. ``border_px`` is the number of pixels
+    that are left out at the edge of a scan; it is always zero. The other fields are those of ``Blocks``.
     """
 
     policy: Policy = "offset"
@@ -84,12 +83,12 @@ class NuisanceProtocol(Record):
 
     @property
     def blocks(self) -> Blocks:
-        """Return the division into fitted and scored pixels."""
+        """Return the rule by which pixels are divided into fitted and scored pixels."""
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
-# Terms whose mean over all scans is attributed to the process and not to single scans. This mean therefore
-# stays in the process model and is not subtracted.
+# For these terms, the mean over all scans is attributed to the process and not to single scans. This mean
+# therefore stays in the process model and is not subtracted.
 PINNED: Terms = frozenset({"offset", "gain"})
 
 
@@ -114,8 +113,9 @@ def smooth_training_terms(policy: Policy) -> Terms:
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
-    """Estimate the terms that each scan adds to the height predicted by a model, from all valid pixels of the
-    scan. Return for each scan the sum of its terms, µm, as a float32 map of shape (ny, nx).
+    """For each scan, estimate the terms that the scan adds to the height predicted by a model, from all its
+    valid pixels. Return the sum of the terms, µm, as a float32 map of shape (ny, nx) for each scan. The means
+    of offset and gain over all scans are not part of this sum, because they are attributed to the process.
 
     Use these maps only for training. For errors that are reported, use ``cross_fit``, which fits the terms to
     pixels that are not scored.

@@ -1,8 +1,8 @@
 """The catalogue of terms that a scan may add to the height of a print.
 
 A term is either a set of smooth maps over the scan (for example datum, gain or bow) or a set of height
-offsets, one for every line. The benchmark, the training, the noise estimate and the loop all use this
-catalogue. ``register_scan_term`` adds a term to the catalogue.
+offsets, one for every line. This catalogue is used by the benchmark, the training, the noise estimate and the
+loop that corrects a model (``litho_models.loop``). ``register_scan_term`` adds a term to the catalogue.
 """
 
 from __future__ import annotations
@@ -82,12 +82,13 @@ class ScanTerm:
         unit: unit of the coefficients: ``µm`` for a height, ``px`` for a displacement, or ``1`` for a
             dimensionless number.
         labels: descriptions of the k maps, one per map. A term of line offsets has a single description.
-        maps: function that returns the smooth maps at given pixels, of shape (k, n). The built-in maps have
-            zero mean over the scan, except those of the datum and of registration errors. None for line
-            offsets.
-        lines: for line offsets, function ``lines(shape, scan_line)`` that returns the line index of each
-            pixel, given the shape of the scan and the index of the scan line of each pixel (or None).
-        frame: for line offsets, a description of the lines that the offsets follow, such as "the scan lines".
+        maps: function that returns the smooth maps at given pixels, of shape (k, n), or None for line
+            offsets. The built-in maps have zero mean over the scan, except the maps of the datum and of
+            registration errors.
+        lines: function that returns the line index of each pixel, for line offsets only. It is called as
+            ``lines(shape, scan_line)`` with the shape of the scan and the index of the scan line of each
+            pixel (or None).
+        frame: name of the lines that have an offset each, such as "the scan lines"; for line offsets only.
     """
 
     name: str
