@@ -3,14 +3,14 @@ false alarms.
 
 The test makes one comparison for each new print. The comparison for a print assumes that the mean changes in
 a step at this print and stays changed until the last print. The values before the step, which include those
-of the reference prints, are compared with the values after it by a t test with a pooled spread. Student's t
-distribution holds for any number of reference prints, although their mean and spread are unknown. The method
-is the likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J.
-Quality Technology 35, 355). The rate of false alarms is divided among the comparisons (Bonferroni). The rate
-therefore holds for all comparisons together, even if they are correlated. A step should be noticed within
-``SOON`` prints. Comparisons with at least ``SOON`` prints after the step therefore get most of the rate. With
-three new prints, the test is nearly the t test of their mean, which is the best possible test if the spread
-is unknown.
+of the reference prints, are compared with the values after it by a t test with a pooled spread. Although the
+mean and the spread must be estimated from the prints, Student's t distribution is exact for any number of
+reference prints. The method is the likelihood-ratio test for a step in the mean with unknown parameters
+(Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of false alarms is divided among the
+comparisons (Bonferroni). All comparisons together therefore have this rate at most, even if they are
+correlated. A step should be noticed within ``SOON`` prints, so comparisons with at least ``SOON`` prints
+after the step get most of the rate. With three new prints, the test is nearly a t test of the mean of these
+three prints, which is the best possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -32,8 +32,9 @@ _LARGEST = 1e4
 
 
 class Series(NamedTuple):
-    """The value of a monitored quantity for each print, in printing order, and the relative variance of each
-    value, which is its variance up to a common unknown factor. There are n reference prints and m new prints.
+    """The value of a monitored quantity for each of n reference prints and m new prints, in printing order,
+    and the relative variances of these values. A relative variance is a variance divided by an unknown
+    factor, which is the same for all prints.
 
     Attributes:
         reference: values of the reference prints, with shape (..., n).
@@ -72,8 +73,8 @@ def shares(new_prints: int) -> Array:
 
 
 def step_statistics(series: Series) -> tuple[Array, Array]:
-    """Return the size of the step and its standard error for every possible first changed print. Both arrays
-    have shape (m, ...).
+    """For every new print, return the size of a step at this print and the standard error of this size. Both
+    arrays have shape (m, ...).
 
     If nothing has changed, the ratio of step to standard error follows Student's t with n + m - 2 degrees of
     freedom.
@@ -113,15 +114,15 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
     """Return the probability that a rise of the mean raises an alarm within ``SOON`` prints, or within all
     new prints if there are fewer.
 
-    The result is a lower bound. This bound is computed from a single comparison, in which the assumed step is
-    at the first print after the rise. The statistic of this comparison has a noncentral t distribution. All
-    values are assumed to be Gaussian.
+    The result is a lower bound, because only one comparison is considered: the step is assumed at the first
+    print after the rise. The statistic of this comparison has a noncentral t distribution. All values are
+    assumed to be Gaussian.
 
     Args:
         step: size of the rise, in units of the unknown spread of a print whose relative variance is 1.
         reference_variance: relative variances of the values of the reference prints, with shape (n,).
         new_variance: relative variances of the values of the new prints, with shape (m,).
-        rate: probability that any of the comparisons raises a false alarm.
+        rate: probability of a false alarm in at least one of the comparisons.
     """
     limit, freedom, error = _comparison(reference_variance, new_variance, rate)
     return float(nct.sf(limit, freedom, step / error))

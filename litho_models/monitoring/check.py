@@ -33,15 +33,15 @@ def check(
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
-        store: dataset store of the new prints. If the model was trained on prints of this store, its locked
-            scans are left out.
+        store: dataset store of the new prints. If the model was trained on prints of this store, the locked
+            scans of the store are left out.
         out: result folder.
-        reference: store of prints made before any change of the printer. By default, the values of the
-            training prints that the model's card contains are the reference.
+        reference: store of prints that were made before any change of the printer. By default, the reference
+            is the values of the training prints, which are stored in the model's card.
         new: names of the new prints, if ``store`` also contains the reference prints. All other prints of the
             store are then reference prints.
-        false_alarms: probability that prints of an unchanged printer raise an alarm in any monitored
-            quantity.
+        false_alarms: probability of at least one alarm in all monitored quantities together if the printer is
+            unchanged.
         tolerance: largest allowed relative drift of a monitored quantity (0.05 is 5 %); by default three
             times the spread of the quantity.
 

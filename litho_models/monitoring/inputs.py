@@ -40,13 +40,13 @@ class Figures(NamedTuple):
 def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
-    """Compute the monitored values of the scans of the new prints and of the reference prints. Only scans
-    that have the most frequent dose of the reference scans, or that state no dose, are kept.
+    """Compute the monitored values of the scans of the new prints and of the reference prints. Scans are
+    dropped if they state a dose other than the most frequent dose of the reference scans.
 
     Raises:
         InputError: there is no reference, or more than one; a print is unknown; a store has another pitch or
-            level height than the model; the stores of the new prints and of the reference prints contain the
-            same scans; or there are too few prints.
+            level height than the model; a scan is both in the store of the new prints and in the store of the
+            reference prints; or there are too few prints.
     """
     if reference is not None and new:
         raise InputError("reference", got="both a store and --new", wanted="only one of these")
@@ -109,8 +109,8 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
 
 
 def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[ScanFigures]:
-    """Compute the monitored values of the scans of a store, and add the excluded scans to ``dropped``. If the
-    model was trained on prints of this store, locked scans are excluded.
+    """Compute the monitored values of the scans of a store. Add excluded scans to ``dropped``: scans of flat
+    layouts and, if the model was trained on prints of this store, locked scans.
     """
     seen, locked = trained_ids(frozen, store), []
     if made_of_these_prints(frozen, store):

@@ -45,10 +45,10 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     """Fit a straight trend to the values of all prints, and estimate the number of prints until the drift may
     reach the tolerance.
 
-    The drift is the change since the model was made, i.e. the slope of the trend times the number of prints
-    since then. The model is assumed to have been made at the middle of the reference prints. The 95 % bound
-    on the drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift.
-    Sudden steps are not part of the forecast, because they raise an alarm.
+    The drift is the slope of the trend times the number of prints since the model was made. The model is
+    assumed to have been made at the middle of the reference prints. For the 95 % bound on the drift, the
+    slope is set to the steeper end of its confidence interval. The forecast assumes a steady drift. It does
+    not include sudden steps, because they raise an alarm.
 
     Args:
         values: one value per print in printing order, with shape (n,); at least three.
@@ -93,7 +93,7 @@ def judge(
         tolerance: largest allowed relative drift of a quantity; by default three times its spread between
             reference prints.
         between: True if new prints may have been made between reference prints. The trend is then fitted to
-            all prints in their common printing order. If False, all new prints are taken to come after the
+            all prints in their common printing order. If False, all new prints are assumed to follow the
             reference prints.
     """
     return [
@@ -103,7 +103,7 @@ def judge(
 
 
 def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
-    """Return the part of the rate of false alarms that is allotted to each quantity."""
+    """Divide the rate of false alarms among the quantities, and return the part of each quantity."""
     total = sum(figure.weight for figure in figures)
     return [rate * figure.weight / total for figure in figures]
 

@@ -36,8 +36,8 @@ FIGURES = (
     Figure(
         "gain",
         "height gain",
-        # The gain of a failed print may be near or below 0, where its logarithm is very low or does not
-        # exist. The gain is therefore limited from below.
+        # The gain of a failed print may be near or below 0. A lower limit on the gain keeps its logarithm
+        # finite.
         lambda scan: float(np.log(max(scan.gain, _LEAST_GAIN))),
         "the printer (dose, development) or the height scale of the microscope: a scan of a step of known "
         "height tells them apart",
@@ -93,8 +93,8 @@ class Spread(NamedTuple):
 
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
-    """Return the names of the prints in printing order. Prints are sorted by the position of their first scan
-    in this order.
+    """Return the names of the prints in printing order. The position of a print is the position of its first
+    scan.
     """
     return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
@@ -102,8 +102,8 @@ def in_order(rows: Sequence[ScanFigures]) -> list[str]:
 def printing_order(
     reference: Sequence[ScanFigures], new: Sequence[ScanFigures], *, between: bool
 ) -> np.ndarray:
-    """Return the printing order of all prints, as indices into the list of the reference prints followed by
-    the new prints. The argument ``between`` has the meaning that it has in ``judge``.
+    """Return the printing order of all prints, as indices into a list of all prints. In this list, the
+    reference prints come first, and the new prints follow. ``between`` has the same meaning as in ``judge``.
     """
     names = [*in_order(reference), *in_order(new)]
     if not between:
@@ -122,11 +122,11 @@ def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
 
 def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Compute the mean and the spread of a quantity over at least two prints. A one-way analysis of variance
-    divides the spread into its variance between prints and within prints.
+    splits the variance into a part between prints and a part within prints.
 
-    The division is needed because the mean over the four scans of one print varies less than the value of a
-    print with a single scan. Prints with several scans show how much of the variation comes from the scans. A
-    negative estimate of the variance between prints is set to 0.
+    The two parts are needed because a mean over several scans of a print varies less than the value of a
+    single scan. The part within prints is known only if some prints have several scans. A negative estimate
+    of the variance between prints is set to 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -152,10 +152,10 @@ class CheckedModel(Record):
 
 
 class Alarm(Record):
-    """A relative step in the mean of a monitored quantity. ``since`` is the name of the first changed print.
+    """A step in the mean of a monitored quantity. ``since`` is the name of the first print after the step.
 
-    ``step`` is the mean from ``since`` on, minus the mean of the earlier prints, relative to the mean of the
-    earlier prints. Its confidence interval does not account for the choice of ``since``.
+    ``step`` is the relative difference between the mean of the prints from ``since`` on and the mean of the
+    earlier prints. The confidence interval of ``step`` does not account for the choice of ``since``.
     """
 
     since: str
@@ -164,16 +164,16 @@ class Alarm(Record):
 
 
 class FigureCheck(Record):
-    """The comparison of new prints with reference prints in one monitored quantity. All values of the
-    quantity except ``mean`` are relative: 0.01 is 1 %.
+    """The comparison of new prints with reference prints in one monitored quantity. ``mean`` is the geometric
+    mean of the quantity. All other values of the quantity are relative: 0.01 is 1 %.
 
-    ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound on the p value of a
-    change. An alarm is raised if ``p`` is at most ``alarm_at``, which is this quantity's part of the rate of
-    false alarms. ``noticeable_step`` is the rise r that raises an alarm with a probability of 90 % within
-    three new prints, or within all new prints if there are fewer than three. A fall by r/(1 + r) raises an
-    alarm equally often. ``noticeable_step`` is None if the rise would exceed a factor of e. ``trend`` is the
-    change from print to print, fitted to all prints. ``measure_again_in`` is the number of prints until the
-    95 % bound on the drift reaches ``tolerance``.
+    ``mean`` and ``spread`` describe the reference prints. ``p`` is an upper bound on the p value of a change.
+    If ``p`` is at most ``alarm_at``, there is an alarm. ``alarm_at`` is the part of the rate of false alarms
+    that is allotted to this quantity. ``noticeable_step`` is the rise r that raises an alarm with a
+    probability of 90 % within three new prints, or within all new prints if there are fewer than three. A
+    fall by r/(1 + r) raises an alarm equally often. ``noticeable_step`` is None if the rise would exceed a
+    factor of e. ``trend`` is the change from print to print, fitted to all prints. ``measure_again_in`` is
+    the number of prints until the 95 % bound on the drift reaches ``tolerance``; after an alarm, it is 0.
     """
 
     name: str
@@ -197,8 +197,8 @@ class Check(Result):
     """The record ``check.json``. ``verdict`` states the result in sentences for people, and ``alarm`` states
     the result for programs.
 
-    ``false_alarm_rate`` is the probability that a dataset of this size from an unchanged printer raises an
-    alarm.
+    ``false_alarm_rate`` is the probability of an alarm for a dataset of this size if the printer is
+    unchanged.
     """
 
     SCHEMA = "litho-models/check/2"

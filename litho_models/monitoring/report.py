@@ -56,8 +56,8 @@ def write_check_report(result: Check, out: str | Path, *, between: bool) -> Path
 def control_chart(result: Check, one: FigureCheck, *, between: bool) -> Figure:
     """Draw one monitored quantity of all prints, relative to the mean of the reference prints. Large dots are
     prints and small dots are scans. One band shows the spread of the reference prints. If there is an alarm,
-    another band marks each changed print. A dotted line separates reference and new prints, unless new prints
-    may have been made between reference prints.
+    another band marks each changed print. Dashed lines mark the tolerance. A dotted line separates reference
+    and new prints, unless new prints may have been made between reference prints.
     """
     from matplotlib.ticker import MaxNLocator
 

@@ -11,13 +11,12 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# The new layouts are taken to be of another kind if all new scans have a greater relief than every reference
-# scan by more than this factor, or all have a smaller relief by more than this factor. The same holds for the
-# steepness.
+# The new layouts count as layouts of another kind if the relief of every new scan is more than this factor
+# above the largest relief of the reference scans, or more than this factor below the smallest. The same rule
+# is applied to the steepness.
 _OTHER_KIND = 1.1
-# The error on training scans is smaller than on unseen scans. The value below is the largest difference that
-# does not raise the rate of false alarms noticeably, in units of the spread of the error between reference
-# scans.
+# The error on training scans is smaller than on unseen scans. A difference up to this value, in units of the
+# spread of the error between reference scans, does not raise the rate of false alarms noticeably.
 _BEARABLE_OPTIMISM = 0.25
 
 
@@ -51,12 +50,12 @@ def _sentences(template: str, **values: object) -> list[str]:
 
 
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Return True if the errors on the reference scans are too small to be compared with errors on unseen
-    prints, because the model was trained on these scans.
+    """Return True if the errors on the reference scans cannot be compared with errors on unseen prints,
+    because the model was trained on the reference scans and their errors are too small.
 
     On scans that were used in the fit, a model has a smaller error than on unseen scans. The relative
-    difference is about the number of parameters divided by the number of independent pixels, where all pixels
-    within one correlation length of the residual count as one.
+    difference is about the number of parameters divided by the number of independent pixels. All pixels of a
+    square with the side of one correlation length of the residual count as one independent pixel.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))
