@@ -66,30 +66,31 @@ def benchmark(
             parts of the same scans, so errors are underestimated. Use it only for comparison with the paper.
         models: names of the models to compare.
         settings: values for fields of ``TrainingConfig``, which replace the values of the recipe.
-        folds: number of folds of the split ``grouped``, at most the number of unlocked printed fields.
-        first_folds: number of folds to fit and score, for a quick comparison of seeds or settings; None fits
-            and scores all folds.
-        policy: policy, i.e. set of nuisance terms that are fitted to each scan before its
-            ``mae_datum_free_nm`` is computed; by default ``offset``, or ``none`` for films.
+        folds: number of folds of the split ``grouped``. If there are fewer printed fields that are not
+            locked, each of these fields is a fold.
+        first_folds: fit and score only this number of folds, for a quick comparison of seeds or settings; by
+            default all folds.
+        policy: name of a set of nuisance terms, which are fitted to each scan before ``mae_datum_free_nm`` is
+            computed; by default ``offset``, or ``none`` for films.
         background: ``training``, ``shared`` or ``none``; by default ``training``, or ``none`` for films. With
             ``training``, the smooth background that each fit learns from its training scans is added to its
             predictions. With ``shared``, each fit also learns a measurement model, which is applied to its
             predictions. A measurement model levels whole scans, so ``shared`` cannot be combined with the
             quadrants of ``paper``.
-        noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
-            states is shown beside the errors. By default, the noise floor is estimated from the held-out
-            residuals of the best model.
+        noise: path of the ``noise.json`` of this dataset, or of the folder with this file. The noise floor in
+            this file is shown beside the errors. By default, the noise floor is estimated from the residuals
+            of the best model on held-out scans.
         open_lock_box: also train each model on all scans that are not locked, and score it on the locked
             scans.
         seed: seed of the split, of the pixel blocks on which nuisance terms are fitted, and of the training.
-        workers: number of local processes that fit and predict; ``dask``: address of a Dask scheduler to use
-            instead of local processes.
+        workers: number of local processes that fit and predict. ``dask`` is the address of a Dask scheduler
+            that is used instead of local processes.
 
     Raises:
         InputError: no model is given, or a model is unknown or repeated; the store cannot be read, or is too
-            small for the split or the lock box; ``shared`` is wanted for ``paper``; ``first_folds`` exceeds
-            the number of folds; the noise analysis belongs to other data; the cache is damaged; or ``out``
-            holds a benchmark with models or scans that the new benchmark does not contain.
+            small for the split or the lock box; ``shared`` is combined with ``paper``; ``first_folds``
+            exceeds the number of folds; the noise analysis belongs to other data; the cache is damaged; or
+            ``out`` holds a benchmark with models or scans that the new benchmark does not contain.
     """
     require_models(models)
     dataset = open_store(store)
@@ -191,8 +192,8 @@ def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
     """
     fits: _Fits = {}
     done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
-    # The training times of the models differ too much for one common estimate of the remaining time. The
-    # remaining time is therefore estimated for each model separately, unless the fits run in other processes.
+    # The models differ too much in training time for one common estimate of the remaining time. The remaining
+    # time is therefore estimated for each model separately, unless the fits run in other processes.
     of = len(jobs) if places.elsewhere else 0
     first, rest = jobs[0][1], len({job[1].number for job in jobs}) - 1
     started = time.monotonic()

@@ -39,26 +39,24 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    A scan counts as locked if this store locks it, or if it was locked when the model was trained. A model
-    counts as trained on these prints if it was trained on this store or on another store made from the same
-    raw files. For such a model, locked scans are scored only if ``open_lock_box`` is set. A model trained on
-    other prints is scored on all scans. The result states which scans are locked and whether any of them was
-    scored.
+    A scan counts as locked if this store locks it, or if it was locked when the model was trained. If the
+    model was trained on this store, or if scans of this store were locked when the model was trained, locked
+    scans are scored only if ``open_lock_box`` is set. In all other cases, all scans are scored. The result
+    states which scans are locked and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: policy, i.e. set of nuisance terms that are fitted to each scan before its datum-free error is
+        policy: name of a set of nuisance terms, which are fitted to each scan before the datum-free error is
             computed; by default ``offset``, or ``none`` for films.
-        background: ``training`` (the default) adds the background stored in the model's card to the
-            predictions; with ``none`` (the default for films), no background is added. If the card has no
-            background for scans of the size of those in the store, none is added either, and the result says
-            so.
-        noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
-            states is shown beside the errors.
+        background: ``training`` (the default) adds the background in the model's card to the predictions.
+            ``none`` (the default for films) adds no background. If the card has no background for fields of
+            this size, none is added, and the result states the background ``none``.
+        noise: path of the ``noise.json`` of this dataset, or of the folder with this file. The noise floor in
+            this file is shown beside the errors.
         extrapolate: accept layouts with heights outside the calibrated range that the model's card states.
-        open_lock_box: also score the locked scans if the model was trained on these prints.
+        open_lock_box: also score locked scans that would otherwise be left out.
 
     Raises:
         InputError: the model or the store cannot be read, their pitch or level height differs, no scan is

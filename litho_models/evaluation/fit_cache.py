@@ -1,5 +1,5 @@
-"""Cache the fits of a benchmark. The cache stores the record of each fit and the heights that it predicts for
-its held-out scans.
+"""Cache the fits of a benchmark. The cache stores the record of each fit and the heights that the fitted
+model predicts for the held-out scans.
 
 Each fit (one model on one fold) has its own folder. The name of the folder contains a hash of everything on
 which the result of the fit depends.
@@ -37,8 +37,8 @@ class FitDiagnostics(Record, extra="ignore"):
 
     Each error is the datum-free error, with the policy ``offset`` and without a background, averaged over
     scans. The three errors are computed in the same way, so differences between them show over-fitting.
-    ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the model of the
-    microscope that was learned together with the fit, if there is one.
+    ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the measurement model
+    that was learned with the fit, or None if there is none.
     """
 
     background: Background
@@ -52,8 +52,8 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(FitFacts):
-    """The record of one fit: its scans, its duration, and its errors in nm after each round of training. A
-    validation error is None if there are no validation scans.
+    """The record of one fit: its scans, its duration, and its errors, nm, after each training step that
+    ``steps`` lists. A validation error is None if there are no validation scans.
     """
 
     model: str
@@ -73,10 +73,10 @@ def fit_or_load(
     fit and the heights, µm, that it predicts for the held-out scans, as one array of shape (ny, nx) per scan.
 
     Args:
-        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. The
-            measurement model is learned from the residuals of a first fit, and the contribution that it
-            predicts is removed from the training scans. Then the fit is repeated, and the measurement model
-            is learned again.
+        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. This
+            model is learned from the residuals of a first fit. The contribution that it predicts is
+            subtracted from the training scans, and the fit is repeated. Then the measurement model is learned
+            again.
 
     Raises:
         InputError: the cached fit cannot be read.
@@ -106,8 +106,9 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the predicted scan. Depending on ``background``, the predicted print is combined with the
-    background or the measurement model that the fit learned from its training scans, or is returned alone.
+    """Return the predicted scan. With the background ``training`` or ``shared``, the predicted height is
+    combined with the background or the measurement model that was learned from the training scans of the fit.
+    With ``none``, it is returned alone.
     """
     found = record.diagnostics
     if background == "none":
@@ -123,8 +124,8 @@ def fit_folder(cache: Path, name: str, key: str) -> Path:
 
 
 def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
-    """Read the record of a fit and the heights, µm, that it predicts for the scans in the record's
-    ``held_out_ids``. There is one array of shape (ny, nx) per scan.
+    """Read the record of a fit, and the predicted heights, µm, of the scans in the record's ``held_out_ids``.
+    There is one array of shape (ny, nx) per scan.
 
     Raises:
         InputError: a file is missing or damaged.

@@ -143,8 +143,8 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
-    """Draw one panel for each label. In each panel, every model has a solid line in its colour. If the
-    function of the panel returns a second list of y values, this list is drawn as a dashed line.
+    """Draw one panel for each label. A panel shows one solid line per model. If the function of the panel
+    returns a second list of y values, a dashed line shows these values.
     """
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
     grid = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -67,17 +67,17 @@ class Benchmark(Result):
 
 
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
-    """Compare the datum-free mean absolute errors of two results, scan by scan. Each result is a
-    ``benchmark.json`` or an ``evaluation.json``.
+    """Compare the leading errors of two results, scan by scan: the datum-free mean absolute error or, for
+    films, the mean shift of the edges. Each result is a ``benchmark.json`` or an ``evaluation.json``.
 
-    Models that both results contain are compared with each other. If each result contains only one model,
-    these two models are compared, even if their names differ. A negative difference means that the model of
-    the first result is better.
+    Each model that both results contain is compared between the two results. If each result contains only one
+    model, these two models are compared, even if their names differ. A negative difference means that the
+    model of the first result is better.
 
     Raises:
-        InputError: a file cannot be read; the results differ in data, folds, scored scans or nuisance terms;
-            the model of one result was trained on the scored scans, but the model of the other was not; or no
-            model is in both results.
+        InputError: a file cannot be read; the results differ in data, split, scored scans, nuisance terms or
+            background; the model of only one of the results was trained on scored scans; or there are no
+            models to compare.
     """
     import pandas as pd
 
@@ -102,8 +102,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Read a result. Return the facts that must be the same in two results that are compared, and the scores
-    of this result, keyed by model name.
+    """Read a result. Return its facts that must equal those of a result with which it is compared, and its
+    scores, keyed by model name.
     """
     file = Path(path)
     if file.is_dir():

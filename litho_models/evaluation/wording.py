@@ -12,8 +12,8 @@ _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """Return sentences that state which model predicts best, by how much, whether the difference to the other
-    models is more than chance, and how large the noise floor is.
+    """Return sentences that state which model predicts best, by how much it is better than the second-best
+    model, whether this difference is more than chance, and how large the noise floor is.
 
     If the scans come from several prints, the test of the difference treats prints instead of scans as
     independent.
