@@ -102,8 +102,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Read a result. Return its facts that must equal those of a result with which it is compared, and its
-    scores, keyed by model name.
+    """Read a result. Return the facts that must agree between two compared results, and the scores, keyed by
+    model name.
     """
     file = Path(path)
     if file.is_dir():

@@ -94,8 +94,8 @@ class SigmaBin(Record, extra="ignore"):
     """The results for the pixels at which one covariate lies in one range: the measured and the predicted
     spread of the residual, and the coverage of the stated intervals.
 
-    The coverages are those of the 68 % and 95 % intervals. Each coverage has a 95 % confidence interval from
-    resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.
+    The coverage is stated for the 68 % and the 95 % interval. Each coverage has a 95 % confidence interval
+    from resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.
     """
 
     covariate: str

@@ -89,8 +89,8 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     evaluated, and why. If too few doses can be evaluated, None is returned instead of the matrix.
 
     A dose is evaluated only if three levels have areas that are wide enough to measure. A matrix needs at
-    least two such doses. Among the doses at which the fewest steps are lost, the recommended dose is the one
-    whose printed heights are nearest to the nominal heights.
+    least two such doses. Among the doses at which the fewest steps are lost, the dose with a ``height_gain``
+    closest to 1 is recommended.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:

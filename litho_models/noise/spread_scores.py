@@ -72,7 +72,7 @@ class Tails:
         """Return the continuous ranked probability score in the unit of the residual.
 
         The score generalises the absolute error to predictions that state a spread. As the scale approaches
-        0, the score approaches the absolute value of the residual. For Student's t, the formula is that of
+        0, the score approaches the absolute value of the residual. For Student's t, the formula comes from
         Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
         z, n = residual / scale, self.freedom

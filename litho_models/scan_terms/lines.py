@@ -22,7 +22,7 @@ def scan_line_index(
     Args:
         shape: shape (ny, nx) of the layout.
         scan_to_layout: matrix of shape (3, 3) that maps homogeneous coordinates (x_um, y_um, 1) of the scan
-            to those of the layout.
+            to homogeneous coordinates of the layout.
         pitch_um: size of a layout pixel. The distance between scan lines is assumed to equal this size.
         bend_um: bend of the scan, which ``scan_to_layout`` does not contain; None if the scan is not bent.
     """

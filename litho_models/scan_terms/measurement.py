@@ -153,8 +153,8 @@ class MeasurementModel(Record):
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Displace a predicted height map by those of the given parts that are displacements. Ignore the other
-    parts. The height map and the result have shape (ny, nx) and are in µm.
+    """Displace a predicted height map. Of the given parts, only the displacements are used. The height map
+    and the result have shape (ny, nx) and are in µm.
     """
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]

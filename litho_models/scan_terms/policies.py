@@ -63,7 +63,7 @@ class NuisanceProtocol(Record):
     prediction. ``background`` is ``training`` if the scored predictions include the smooth background of the
     training scans, ``shared`` if they include the whole measurement model, and ``none`` if they include
     neither. No part of the background is fitted to the scored scan. ``border_px`` is the number of pixels
-    that are left out at the edge of a scan; it is always zero. The other fields are those of ``Blocks``.
+    that are left out at the edge of a scan; it is always zero. The other fields are explained at ``Blocks``.
     """
 
     policy: Policy = "offset"

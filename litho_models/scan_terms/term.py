@@ -135,7 +135,7 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
 
 
 def line_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """Return those of the named terms that are line offsets."""
+    """From the named terms, return the line offsets."""
     return [term for term in chosen_terms(names) if term.lines is not None]
 
 

@@ -39,8 +39,8 @@ class LikePixels(NamedTuple):
     partners: Array
 
     def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
-        """Return an estimate of the noise variance at each pixel of the sample, and the squared residual
-        there. Both arrays have shape (n,).
+        """Return, for each pixel of the sample, an estimate of the noise variance, and the squared residual.
+        Both arrays have shape (n,).
 
         Let r₀ be the residual of a pixel, and r₁ ... r_m the residuals of its partners. Each of them is the
         sum of its own noise and a misfit, which is the same for all of them because their surroundings are
