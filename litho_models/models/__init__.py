@@ -45,9 +45,10 @@ _REGISTERED: dict[str, list[str]] = {}
 
 
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
-    """Register a class of models, so that all functions and commands of this process know it by its name.
+    """Register a class of models. Every function and command in this Python process then accepts the name of
+    the model.
 
-    To register the class in every process that a command starts, call this function in a plug-in.
+    If a plug-in calls this function, the class is also registered in every process that a command starts.
 
     Raises:
         InputError: the class has no name, its name is already taken, or it lacks ``reach_px`` or
@@ -64,8 +65,9 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
 
 
 def registered_sources(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return hashes of the registered code on which a model depends: its class and the parts that its
-    settings name. The dict is empty if the model and all of its parts belong to this package.
+    """Return hashes of the registered code on which a model depends: the code of the model's class, and the
+    code of the parts that ``settings`` names. The dict is empty if the model and all of its parts belong to
+    this package.
     """
     modular = issubclass(model_class(name), Printer)
     named = settings["parts"] if modular else [settings.get("illumination")]
@@ -103,7 +105,7 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """Return the names of the parameters of a model that no fit changes.
+    """Return the names of those parameters of a model that stay fixed in every fit.
 
     These are the parameters that are fixed by default, plus the parameters in ``fix``, minus the parameters
     in ``free``.
@@ -146,8 +148,8 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
 
 
 def _require_heights(model: Simulator) -> None:
-    """Predict a ramp over all levels, and raise an InputError that names the model if this fails or if the
-    result is not a finite height for each pixel.
+    """Predict the print of a layout that rises evenly over all levels. Raise an InputError that names the
+    model if the prediction fails or is not a finite height for each pixel.
     """
     side = model.tile.size_px if model.tile else _TRIAL_PX
     ramp = torch.linspace(0, model.config.full_height_um, side * side).reshape(1, 1, side, side)

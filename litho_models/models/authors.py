@@ -1,5 +1,5 @@
 """Load weights that were trained with the code of the paper's authors, and use them in the models of variant
-``authors``. The names of the weights are translated from the authors' code to this package.
+``authors``. Each weight is renamed from its name in the authors' code to its name in this package.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """

@@ -126,7 +126,7 @@ def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
     """Blur a layout and crop ``reach_px`` pixels at each edge. ``sigma_um`` is the standard deviation of the
-    blur, or a pair of them, along y and along x.
+    blur, or a pair of standard deviations (along y, along x).
     """
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
@@ -146,8 +146,9 @@ class LinearConfig(SimulatorConfig):
 
 
 class Linear(Simulator):
-    """A weighted sum of features: H = w · φ(M). The features φ are Gaussian blurs of the layout, the second
-    to fourth powers of one of the blurs, the squared slopes of this blur, and the constant 1.
+    """A weighted sum of features: H = w · φ(M). The features φ are Gaussian blurs of the layout, powers and
+    squared slopes of one further blur B, and the constant 1. The powers are (B - r)², (B - r)³ and (B - r)⁴,
+    where r is ``power_reference_um``.
 
     The slopes along y and along x have separate weights, because the two axes of a print may differ.
     """

@@ -1,5 +1,5 @@
-"""Networks whose inputs are features without parameters. The features of a pixel describe either the layout
-around the pixel, or the printed height along x.
+"""Networks that compute a part of the height of each pixel from features of this pixel. The features have no
+parameters. They describe either the layout around the pixel or the printed height along x.
 
 Because the features do not change during a fit, they are computed only once, and the networks are fitted to
 single pixels (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes
@@ -57,8 +57,8 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 class FeatureNetwork(OfField):
     """A network that computes a contribution to the height, µm, from the features of each pixel. The
-    contribution is the sum of a linear function of the features and of a network with hidden layers. Before
-    training, both parts are zero.
+    contribution is the sum of two parts: a linear function of the features, and the output of hidden layers.
+    Before training, both parts are zero.
     """
 
     # Whether the network may add a constant height.
@@ -92,8 +92,8 @@ class FeatureNetwork(OfField):
         return max(self._radius(*config.blurs_um), slopes, self._steps_px()[-1], steep)
 
     def forward(self, field_um: Tensor) -> Tensor:
-        """Return the contribution of the network to the height of the interior, µm. It has shape (batch, 1,
-        ny - 2r, nx - 2r), where r is ``reach_px``.
+        """Return the contribution of the network to the height of the interior, µm. The result has shape
+        (batch, 1, ny - 2r, nx - 2r), where r is ``reach_px``.
         """
         features = self.features(field_um)
         with torch.autocast(device_type=field_um.device.type, enabled=False):
@@ -127,7 +127,9 @@ class FeatureNetwork(OfField):
         """
 
     def _steepness(self, field: Tensor) -> list[Tensor]:
-        """Return local means, around each pixel, of the magnitude of the slope and of its square."""
+        """Return the magnitude of the slope and the squared slope, each averaged over several widths around
+        every pixel.
+        """
         sigma, widths = self.config.slope_blurs_um[0], self.config.steep_um
         margin = self._radius(*widths)
         slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
@@ -200,8 +202,8 @@ class ScanAxis(FeatureNetwork):
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:
-    """Apply a linear layer to values whose last axis numbers the pixels. ``values`` has shape (inputs, n),
-    and the result has shape (outputs, n).
+    """Apply a linear layer at each of n pixels. ``values`` has shape (inputs, n), and the result has shape
+    (outputs, n).
     """
     if layer.bias is None:
         return layer.weight @ values

@@ -101,9 +101,10 @@ class Features(OfField, Simulator):
     The features φ are:
 
     - blurs, their cubes, and the products of any two blurs;
-    - slopes along y and x at several blurs, with their magnitudes, products and second derivatives;
+    - slopes of blurred layouts along y and x, with the magnitudes and products of these slopes;
     - copies of the layout that are displaced up, down, left and right, and the magnitudes of the height
       differences between the layout and these copies;
+    - second derivatives of blurred layouts, and products of a blurred layout and its slopes;
     - blurs along one axis;
     - the steepness of the surroundings along each axis.
 
@@ -139,8 +140,8 @@ class Features(OfField, Simulator):
         return self.weights @ self.completed(torch.stack(features))
 
     def completed(self, features: Tensor) -> Tensor:
-        """Add further features that are computed from φ(M), if the model has any. ``features`` contains φ(M)
-        at n pixels. The result has one row for each weight and therefore shape (weights, n).
+        """Append the further features that a subclass computes from φ(M). ``features`` contains φ(M) at n
+        pixels. The result has one row for each weight and therefore shape (weights, n).
         """
         return features
 
@@ -163,8 +164,8 @@ class Features(OfField, Simulator):
         return simple, [*products, torch.ones_like(blurs[0])]
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """Evaluate every weighted feature at n pixels. ``at`` contains their flat indices in the interior of
-        a layout of shape (1, 1, ny, nx). The result has shape (weights, n).
+        """Evaluate every weighted feature at n pixels. ``at`` contains the flat indices of these pixels in
+        the interior of a layout of shape (1, 1, ny, nx). The result has shape (weights, n).
         """
         simple, products = self.features(layout_um)
         return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
@@ -204,8 +205,8 @@ class Features(OfField, Simulator):
         return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
 
     def _steepness(self, layout: Tensor) -> list[Tensor]:
-        """Return local means of the magnitude and of the square of the slope along y and along x. A slope
-        here is the height change over the distance σ.
+        """Return the magnitude and the square of the slope along y and along x, each averaged over several
+        widths around every pixel. A slope here is the height change over the distance σ.
         """
         widths, found = self.config.steep_widths_um, []
         margin = self._radius(*widths)
@@ -232,9 +233,9 @@ class RandomFeatures(Features):
     """The model ``Features`` with additional features tanh(V z + c), where z are the standardised simple
     features. V and c are random and not fitted.
 
-    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). This
-    model can represent more functions than the products of two features, and its weights are still found in
-    closed form.
+    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). Each
+    random feature depends on several simple features (``inputs``), while a product depends on only two. The
+    weights are still found in closed form.
     """
 
     name = "random-features"
@@ -260,8 +261,8 @@ class RandomFeatures(Features):
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return four fields: the values ``step`` pixels above, below, left and right of each pixel that is at
-    least ``step`` pixels from the edge.
+    """For each pixel that is at least ``step`` pixels from the edge, return the values ``step`` pixels above,
+    below, left and right of the pixel, as four fields.
     """
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

@@ -1,5 +1,5 @@
-"""FNO: the Fourier neural operator. In the paper, the FNO is the learned simulator without any knowledge of
-physics.
+"""FNO: the Fourier neural operator. In the paper, the FNO is the simulator that is learned from data alone,
+without knowledge of physics.
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
 24; see arXiv:2309.17343, appendix "Fourier Neural Operator". The output of each layer is the sum of two
@@ -33,8 +33,8 @@ class FnoConfig(SimulatorConfig):
     projection_channels: int = Field(
         128, ge=1, le=4096, description="number of hidden channels between the last two layers"
     )
-    # The paper uses 1 x 1. A convolution of this size maps detail that is finer than the kept modes only
-    # pixel by pixel, without regard to its surroundings.
+    # The paper uses 1 x 1. Detail that is finer than the kept modes is then mapped pixel by pixel, and its
+    # surroundings have no influence on it.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, px; must be odd")
     coordinates: bool = Field(False, description="whether y and x, scaled to 0 ... 1, are further inputs")
     padding_fraction: float = Field(
@@ -74,13 +74,13 @@ class FnoConfig(SimulatorConfig):
 
 
 class Fno(Simulator):
-    """The Fourier neural operator: H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))), where M is the layout and H the printed
-    height. A layer is L(v) = gelu(local(v) + spectral(v)), but the last layer has no gelu.
+    """The Fourier neural operator: H = Q(L₄ ∘ … ∘ L₁(P(M))), where M is the layout and H the printed height.
+    A layer is L(v) = gelu(local(v) + spectral(v)), but the last layer has no gelu.
 
-    P maps each pixel to ``width`` channels, and Q maps the channels to a height through one hidden layer.
-    With ``starts_as_layout``, this height is added to M and is zero before training. If the configuration has
-    a tile size, ``interior`` returns the height of one tile, which is treated as periodic. The heights of the
-    tiles are then blended to the height of the whole layout.
+    P maps each pixel to ``width`` channels. With ``coordinates``, P also receives y and x. Q maps the
+    channels to a height through one hidden layer. With ``starts_as_layout``, this height is added to M and is
+    zero before training. If the configuration has a tile size, ``interior`` returns the height of one tile,
+    which is treated as periodic. The heights of the tiles are then blended to the height of the whole layout.
     """
 
     name = "fno"
@@ -149,7 +149,9 @@ class Fno(Simulator):
 
 
 class PeriodicConvolution(nn.Conv2d):
-    """A convolution of a periodic field that keeps its size. Fields have shape (batch, ny, nx, channels)."""
+    """A convolution that treats a field as periodic and returns a field of the same size. Fields have shape
+    (batch, ny, nx, channels).
+    """
 
     def forward(self, features: Tensor) -> Tensor:
         if margin := self.kernel_size[0] // 2:
@@ -160,8 +162,8 @@ class PeriodicConvolution(nn.Conv2d):
 
 class SpectralConvolution(nn.Module):
     """A convolution that is computed in Fourier space. At each of the lowest frequencies k, the vector v̂(k)
-    of the Fourier coefficients of all channels is multiplied by a matrix W(k). All other frequencies are set
-    to zero.
+    of the Fourier coefficients of all channels is multiplied by a matrix W(k). The coefficients at all other
+    frequencies are set to zero.
 
     The weights are stored as real numbers, so that they can be saved and converted like any other parameter.
     Their shape is (2, channels in, channels out, modes along y, modes along x, 2). The first axis is the sign
@@ -173,8 +175,8 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Convolve a field of shape (batch, ny, nx, channels). If the field is so small that it has fewer
-        frequencies than there are modes, only some of the modes are used.
+        """Convolve a field of shape (batch, ny, nx, channels). If the field has fewer frequencies than the
+        convolution has modes, only the lowest modes are used.
 
         Only a few frequencies are kept. Multiplying by the waves of these frequencies is therefore cheaper
         than a fast Fourier transform.
@@ -211,7 +213,7 @@ def _waves(frequencies: Tensor, size: int, like: Tensor) -> Tensor:
 
 
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:
-    """Apply a 1 x 1 convolution to features whose last axis numbers the channels."""
+    """Apply a 1 x 1 convolution to features of shape (..., channels)."""
     return functional.linear(features, convolution.weight[:, :, 0, 0], convolution.bias)
 
 

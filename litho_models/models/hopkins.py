@@ -3,8 +3,8 @@
 In Hopkins' theory (Proc. R. Soc. A 217, 408 (1953)), the intensity is I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi
 (f₁ - f₂) x), where T is the spectrum of the mask t. The transmission cross coefficients are C(f₁, f₂) = Σ_s
 P(f₁ + s) P*(f₂ + s), a sum over the points s of the source, where P is the pupil. C is the matrix A⁺A with
-A(s, f) = P(s + f). The right singular vectors of A, times the singular values, are therefore the transfer
-functions of kernels h_k with I = Σ_k |h_k * t|² (Cobb, PhD thesis, Berkeley 1998).
+A(s, f) = P(s + f). Therefore I = Σ_k |h_k * t|² (Cobb, PhD thesis, Berkeley 1998). The transfer functions of
+the kernels h_k are the right singular vectors of A, each multiplied by its singular value.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Optics(NamedTuple):
         outer, inner: outer and inner radius of a round or ring-shaped source, relative to the radius of the
             pupil. If both are 0, the source is a point.
         defocus_um: distance of the resist from the focus, µm.
-        kernels: number of kernels that are used, i.e. those with the largest singular values.
+        kernels: number of kernels to use. The kernels with the largest singular values are used.
     """
 
     wavelength_um: float
@@ -87,11 +87,11 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
     """Return the complex transfer functions of the kernels of a lens, for a periodic field of shape (ny, nx).
     The result has shape (kernels, ny, nx).
 
-    The points of the source lie on the grid of the field's frequencies. The weight of a point is the share of
-    its frequency cell that the source fills.
+    The points of the source lie on the grid of the field's frequencies. Each point represents one cell of
+    this grid, and its weight is the share of the cell that the source fills.
 
     Raises:
-        InputError: the source is a ring too thin to fill any cell.
+        InputError: the source is a ring that is too thin for this grid.
     """
     fy, fx = (np.fft.fftfreq(n, pitch_um) for n in shape)
     y, x = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))

@@ -2,8 +2,8 @@
 turns one field, such as a dose, into the next field; the parameters of this function; and a reference for its
 formula.
 
-Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. The
-field that a part returns may be cropped by the receptive radius of the part.
+Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. A part
+may crop the field that it returns by its receptive radius on each side.
 """
 
 import math
@@ -63,7 +63,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a printer, which is one stage of its process.
+    """A part of a model. It describes one stage of the printing process.
 
     Attributes:
         numbers: parameters of the part by name; ``source``: reference for the formula.
@@ -128,21 +128,21 @@ def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
 
 
 def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
-    """Return the share of the depth to which a dose E is developed: 1 + γ log₁₀(E / E₀), where γ is the
-    contrast and E₀ the clearing dose. The share is limited to 0 ... 1. At both limits, the curve has rounded
-    instead of sharp corners, so that it stays differentiable.
+    """Return the depth that is developed after a dose E, as a share of the full depth: 1 + γ log₁₀(E / E₀),
+    where γ is the contrast and E₀ the clearing dose. The share is limited to 0 ... 1. At both limits, the
+    curve has rounded instead of sharp corners, so that it stays differentiable.
     """
     depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
     return (functional.softplus(_CORNERS * depth) - functional.softplus(_CORNERS * (depth - 1))) / _CORNERS
 
 
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
-    """Return, for each pixel, the share of its area that is covered by an etched film. The film remains where
-    the resist exceeds the threshold. The result is cropped by one pixel on each side.
+    """Return the share of each pixel's area that an etched film covers. The film remains where the resist
+    exceeds the threshold. The result is cropped by one pixel on each side.
 
     The edge of the film lies where the resist crosses the threshold, moved outward by the bias. A pixel that
-    the edge crosses is partly covered. The coverage is a sigmoid, about one pixel wide, of the distance from
-    the edge, which is (resist - threshold) / |∇ resist| + bias.
+    the edge crosses is partly covered. The coverage is a sigmoid of the distance from the edge, (resist -
+    threshold) / |∇ resist| + bias. The sigmoid is about one pixel wide.
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2
@@ -304,7 +304,7 @@ REGISTERED: dict[str, str] = {}
 
 
 def register_part(part: Part) -> Part:
-    """Register a part. Models in this process can then name it in their setting ``parts``.
+    """Register a part. Models in this Python process can then use its name in their setting ``parts``.
 
     Raises:
         InputError: the name of the part is already taken.

@@ -112,8 +112,8 @@ class PblConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """Make the configuration of a variant, as for other models. The lengths of the feature networks are
-        also scaled to the pitch.
+        """Make the configuration of a variant, as ``SimulatorConfig.of_variant`` does, and also scale the
+        lengths of the feature networks to the pitch.
         """
         config = super().of_variant(variant, **fields)
         parts = {"surroundings": config.surroundings, "scan_axis": config.scan_axis}
@@ -194,7 +194,7 @@ class Pbl(Simulator):
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """Return the model without its feature networks, which is the chain of steps in the paper."""
+        """Return the model without its feature networks. What remains is the chain of steps in the paper."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
@@ -232,8 +232,8 @@ class Pbl(Simulator):
         return height
 
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the height of the interior that the chain predicts and, for each feature network, the field
-        from which its features are computed. All are in µm.
+        """Return the chain's prediction of the height of the interior. Also return, for each feature network,
+        the field from which its features are computed. All are in µm.
         """
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
         printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
@@ -311,7 +311,8 @@ class AreawiseNet(nn.Module):
     """A stack of 3 x 3 convolutions that maps one field to one field. ``channels`` are the numbers of
     channels between the convolutions. Every convolution except the last is followed by a leaky ReLU.
 
-    With ``transposable``, each kernel is averaged with its transpose, which treats x and y alike.
+    With ``transposable``, each kernel is averaged with its transpose, so that the network treats x and y
+    alike.
     """
 
     def __init__(self, channels: tuple[int, ...], leaky_slope: float, transposable: bool = False):
@@ -331,8 +332,9 @@ class AreawiseNet(nn.Module):
         return len(self.hidden) + 1
 
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
-        """Apply the network to a height of shape (batch, 1, ny, nx). Return the height of the interior or, if
-        ``padding`` is 1, of the whole field, which every layer then pads with zeros.
+        """Apply the network to a height of shape (batch, 1, ny, nx). If ``padding`` is 0, return the height
+        of the interior. If ``padding`` is 1, every layer pads its input with zeros, and the height of the
+        whole field is returned.
         """
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):

@@ -98,10 +98,10 @@ class Physics(Simulator):
     1 µm and g is 1. If the threshold is below 0, it lies below the lowest level, and the projection uses only
     the concave part of the tanh.
 
-    The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The diffused
-    dose is scaled by a fixed range in the variant ``default``, by the range of the dose in the layout in
-    ``paper``, and by the maximum of the dose in the layout in ``authors``. In ``paper`` and ``authors``, the
-    height of a pixel therefore changes if the layout is cropped differently.
+    The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
+    ``default`` scales the diffused dose by a fixed range. ``paper`` scales it by its range over the layout,
+    and ``authors`` by its maximum over the layout. In ``paper`` and ``authors``, the height of a pixel
+    therefore changes if the layout is cropped differently.
     """
 
     name = "physics"

@@ -32,8 +32,8 @@ class PrinterConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """Make the configuration of a variant, as for other models. ``fields`` may also contain values for
-        parameters of the parts.
+        """Make the configuration of a variant, as ``SimulatorConfig.of_variant`` does. ``fields`` may also
+        contain values for parameters of the parts.
         """
         own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
         own |= {name: value for name, value in fields.items() if "." in name}
@@ -132,7 +132,7 @@ class ElectronBeamConfig(PrinterConfig):
 
 
 class ElectronBeam(Printer):
-    """An electron-beam writer with backscattering. Its resist is the mask for etching a film."""
+    """An electron-beam writer with backscattering. The resist is the mask for etching a film."""
 
     name = "e-beam"
     Config = ElectronBeamConfig
@@ -156,7 +156,7 @@ class LaserWriterConfig(PrinterConfig):
 
 
 class LaserWriter(Printer):
-    """A laser writer that makes multi-level reliefs in a resist with a contrast curve."""
+    """A laser writer that makes multi-level reliefs. The resist is described by a contrast curve."""
 
     name = "laser-writer"
     Config = LaserWriterConfig
@@ -168,9 +168,7 @@ class DmdGrayscaleConfig(PrinterConfig):
 
 
 class DmdGrayscale(Printer):
-    """A printer with a micromirror device that makes multi-level reliefs in a resist in which the dose
-    diffuses.
-    """
+    """A printer with a micromirror device that makes multi-level reliefs. The dose diffuses in the resist."""
 
     name = "dmd-grayscale"
     Config = DmdGrayscaleConfig
