@@ -27,10 +27,10 @@ class EffectChain(nn.Module):
     Args:
         base: a simulator that maps a layout in µm to a height in µm. Both tensors have shape (b, 1, ny, nx).
         effects: parameter values of each effect, keyed by the name of the effect. A parameter that is not
-            given has the value that it has while its effect is off.
-        frames: whether an effect rotates with the print (``print``) or with the scan (``scan``), keyed by the
-            name of the effect. By default, effects of stage ``measurement`` rotate with the scan, and all
-            others rotate with the print.
+            given is set to its value ``Parameter.off``.
+        frames: ``print`` for each effect that rotates with the print, and ``scan`` for each effect that
+            rotates with the scan, keyed by the name of the effect. By default, effects of stage
+            ``measurement`` rotate with the scan, and all others rotate with the print.
     """
 
     def __init__(
@@ -64,7 +64,8 @@ class EffectChain(nn.Module):
         assumed to fill the whole write field.
 
         Args:
-            context: facts about the scan to predict. The layout must then be a single one.
+            context: information about the scan to predict. If it is given, the batch must contain only one
+                layout.
             known: cache of intermediate fields that this chain or other chains have already computed for the
                 same scan: the outputs of the base and of the effects. Newly computed fields are added to this
                 cache.

@@ -76,15 +76,16 @@ class FieldContext:
         field_centre_um: position (y, x) of the centre of this field in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
         slow_axis: axis perpendicular to the written lines.
-        order: position of this field in the writing order, scaled so that the dataset spans -0.5 to 0.5.
+        order: position of this field in the writing order, scaled so that the positions in the dataset run
+            from -0.5 to 0.5.
         scan_shape: numbers of rows and columns of the whole scan, if this field is only a part of a scan.
         origin_px: row and column of this field's first pixel in the whole scan.
         quarter_turns: number of quarter turns by which the print was rotated under the microscope, in the
             direction of ``torch.rot90``.
         backward: whether the scan consists of retrace lines.
         new_tip: whether the scan was made with a new, sharp tip instead of the usual one.
-        pixel_size: pixel size relative to that of the other scans. The time per pixel is the same in all
-            scans, so the length over which the probe lags is proportional to the pixel size.
+        pixel_size: pixel size divided by the pixel size of the other scans. The time per pixel is the same in
+            all scans, so the lag length of the probe is proportional to the pixel size.
         dose: dose relative to the recipe. This dose is already contained in ``layout_um``.
     """
 
@@ -106,8 +107,8 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Return a quantity that depends only on this field and is cached under ``name``. The function
-        ``make`` computes it at the first call, and later calls with the same name return the cached result.
+        """Return a quantity that depends only on this field. At the first call, the function ``make``
+        computes the quantity. Later calls with the same ``name`` return the cached result.
         """
         if name not in self._kept:
             self._kept[name] = make(self)
@@ -168,8 +169,8 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise InputError. This function stands in for the formula of a per-scan effect, which has no formula
-    because its terms are fitted to each scan.
+    """Raise InputError. A per-scan effect has no formula, because its terms are fitted to each scan. This
+    function takes the place of the formula.
     """
     raise InputError(
         "an effect in a model",
@@ -208,7 +209,7 @@ class Effect:
         of_films: True if this effect moves the edges of a film seen from above, and False if it changes
             heights.
         knowledge: what is known about the effect. For a ``cause``, the physical cause is known; for a
-            ``law``, only a formula; for a ``description``, only the variable on which it depends.
+            ``law``, only a formula; for a ``description``, only the variable on which the effect depends.
     """
 
     name: str
@@ -250,12 +251,12 @@ class Effect:
                     yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
     def off_values(self) -> dict[str, float]:
-        """Return values of all parameters at which the effect changes nothing."""
+        """Return the values that the parameters have while the effect is switched off."""
         return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the values of all parameters. A parameter that is not in ``values`` gets the value that it
-        has while the effect is off.
+        """Return the values of all parameters. A parameter that is not in ``values`` is set to its value
+        ``Parameter.off``.
 
         Raises:
             InputError: ``values`` contains a name that is not a parameter of this effect.
@@ -287,12 +288,12 @@ class Effect:
         scanned: bool = False,
     ) -> Tensor:
         """Apply the effect to a layout or height. Numbers in ``values`` are converted to tensors on the
-        device of the array. A parameter that is not in ``values`` gets the value that it has while the effect
-        is off.
+        device of the array. A parameter that is not in ``values`` is set to its value ``Parameter.off``.
 
         Args:
-            scanned: whether to treat the effect as caused by the microscope. An effect of the microscope
-                depends on the orientation, the direction and the tip of the scan.
+            scanned: whether to treat the effect as caused by the microscope. The result then depends on the
+                orientation of the scan, on whether it consists of retrace lines, and on whether its tip was
+                new.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)

@@ -96,7 +96,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     """Cure slices of height t separately: the blurred layout G*M becomes
     (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
 
-    The change from the first to the second of these two expressions is added to the height. The function
+    The difference between these two expressions (second minus first) is added to the height. The function
     ``step`` is a logistic function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice
     that is narrower than the spot is lost, and a gap that is narrower than the spot is filled.
     """

@@ -48,8 +48,8 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Change the height of the print, because the focus surface is tilted and curved over the write field:
-    H + 1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
+    """Add the height changes that a focus surface causes if it is tilted or curved over the write field: H +
+    1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
     field.
     """
     y, x = context.centred_um()
@@ -133,8 +133,8 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shorten every written line by δ at both ends (δ < 0 lengthens it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    The formula gives the correct area that is lost at an edge, but not the correct shape of the edge. The
-    wrong shape does not matter, because the spot is wider than δ and determines the shape of the edge.
+    At an edge, the formula gives the lost area correctly, but not the shape. The error of the shape does not
+    matter, because the spot is wider than δ and determines the shape of the edge.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -203,11 +203,11 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     separating="rescan at 25 nm per pixel",
 )
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add ripples at the hatching pitch p, which appear at their alias frequency f: H + 1[M > 0] (a cos 2π f
-    y + b sin 2π f y).
+    """Add ripples along the slow axis y, which come from the hatching of pitch p: H + 1[M > 0] (a cos 2π f y
+    + b sin 2π f y).
 
-    If the pixels have size dx, the alias frequency is f = |1/p - 1/dx|. The ripples have a fixed phase in the
-    write field, so they are the same in every print.
+    The frequency f is the alias frequency |1/p - 1/dx|, where dx is the pixel size. The ripples have a fixed
+    phase in the write field, so they are the same in every print.
     """
     y, x = context.centred_um()
     phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)

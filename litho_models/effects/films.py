@@ -1,5 +1,5 @@
-"""Effects and laws (short formulas without a known cause) of films. These effects and laws move the edges of
-a written, developed or etched film seen from above.
+"""Effects and laws of films. They move the edges of a written, developed or etched film that is seen from
+above. A law is a short formula without a known cause.
 
 Lengths are in pixels of the layout. These pixels are fine enough to resolve the blur of the beam or lens.
 """

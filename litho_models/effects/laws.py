@@ -1,5 +1,5 @@
-"""Laws: short formulas that describe how the height departs from the model. Each gives this departure as a
-function of the height, the slopes, the surroundings, the position in the scan or the writing order.
+"""Laws: short formulas that describe how the height departs from the model. Each law gives this departure as
+a function of the height, the slopes, the surroundings, the position in the scan or the writing order.
 
 A law is an effect with one strength (a wave has two) and fitted shapes, such as a power, a length, a
 direction or a position. A law names no cause of the departure. Laws are screened, fitted, judged and applied
@@ -72,9 +72,9 @@ class Surface:
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return a function of the position in the scan at each pixel. ``word`` is its name: ``x``, ``y``,
-        ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of the pixel from the edge of
-        the scan and ``length`` is a parameter of the law.
+        """Return a function of the position in the scan at each pixel. ``word`` is the name of the function:
+        ``x``, ``y``, ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of the pixel from
+        the edge of the scan and ``length`` is a parameter of the law.
         """
         y, x = self.context.scan_position()
         if word == "rim":
@@ -84,8 +84,9 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """Return a step function along an axis of the scan. The step lies at the parameter ``position`` of
-        the law. The function is 0 before the step and 1 beyond it, and rises linearly over one pixel.
+        """Return a step function along an axis of the scan. The parameter ``position`` of the law gives the
+        position of the step. The function is 0 before the step and 1 beyond it, and rises linearly over one
+        pixel.
         """
         number = "yx".index(axis)
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
@@ -281,8 +282,8 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
 
 @_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add to the height a correction that depends on the nominal height of the layout. The correction is a
-    parameter at each of seventeen nominal heights, and is interpolated linearly between them.
+    """Add to the height a correction that depends on the nominal height of the layout. At seventeen nominal
+    heights, the correction is a fitted parameter. Between these heights, it is interpolated linearly.
     """
     knots = torch.stack([values[name] for name in _KNOTS])
     smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
@@ -294,8 +295,8 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add to each pixel a weighted sum of the differences between the heights at displaced positions and the
-    height of this pixel. The field is padded with its edge values.
+    """Add a weighted sum of differences to the height of each pixel. Each difference is the height at a
+    displaced position minus the height of the pixel. The field is padded with its edge values.
     """
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
@@ -309,7 +310,7 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
 
 @_table("a gain that depends on the position in the scan", _POWERS, "1")
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the height times a polynomial of the position in the scan."""
+    """Multiply the height by 1 + p, where p is a polynomial of the position in the scan."""
     y, x = context.scan_position()
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 

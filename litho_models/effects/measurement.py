@@ -39,8 +39,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
     The lag has length l on falling edges, and length ``rising`` × l on rising edges, where the surface pushes
     the probe. If ``rising`` is 1, the probe acts as a linear filter. If ``rising`` is below 1, the probe
-    parachutes off falling edges, i.e. it loses contact there. The time constant of the lag is fixed, so the
-    length is shorter if the pixels are smaller.
+    parachutes off falling edges, i.e. it loses contact there. The time constant of the lag is fixed, so l is
+    shorter if the pixels are smaller.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]

@@ -135,7 +135,7 @@ _NAMELESS = {**LAWS, **films.FILM_LAWS, **TABLES}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
-    """Add an effect to the catalogue and return it. From then on, the loop tests this effect too.
+    """Add an effect to the catalogue and return it. From then on, the closed loop also tests this effect.
 
     Args:
         effect: the new effect. A per-scan effect (one whose ``apply`` is ``of_single_scans``) also needs a

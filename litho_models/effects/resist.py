@@ -106,7 +106,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink the tops of the print inwards more than the bases: H(r (1 + s H(r) / H_full)). Here r is the
+    """Shrink the print inwards, at its tops more than at its bases: H(r (1 + s H(r) / H_full)). Here r is the
     position measured from the centre of the field, and H_full is the full height.
 
     The shrinkage at the mean height is a change of magnification, which registration removes. In a scan, the
@@ -152,7 +152,7 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
     """Apply a morphological closing by a square to the height, which fills pits narrower than the square.
 
     The square must be an odd number of pixels wide. For other widths, the result is interpolated between the
-    results of the next narrower and the next wider square.
+    results for the next smaller and the next larger of these squares.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
