@@ -57,9 +57,9 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Context manager for a block that reads files which an earlier run stored in ``folder``. Any error in
-    the block is converted to an InputError. Such files are always written completely, so a file that cannot
-    be read is damaged.
+    """Context manager for a block that reads the files of an earlier run from ``folder``. Any error in the
+    block becomes an InputError. A run writes each file completely or not at all, so a file that cannot be
+    read is damaged.
 
     Raises:
         InputError: a file is missing or damaged.

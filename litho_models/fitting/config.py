@@ -71,9 +71,8 @@ class TrainingConfig(Record):
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, *, film: bool = False, **settings: Any) -> Self:
-        """Return the settings that a named recipe has for a model. Values in ``settings`` replace individual
-        values of the recipe. If ``film`` is True, no terms are fitted to the scans, unless ``settings`` names
-        a policy.
+        """Return the settings of a recipe for a model. Values in ``settings`` replace individual values of
+        the recipe. If ``film`` is True, no terms are fitted to the scans, unless ``settings`` names a policy.
 
         The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
         of 72 quadrants. This recipe uses the learning rates of the paper and fits no per-scan terms. The

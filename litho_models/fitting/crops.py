@@ -1,5 +1,5 @@
-"""Choose the crops on which a model is trained, and cut them out of layouts and scans. A crop may include a
-margin around it.
+"""Choose the crops on which a model is trained, and cut them out of layouts and scans. A crop can be cut out
+together with a margin.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,9 @@ FEWEST_PIXELS = 1024
 
 
 def part_to_fit(counts: Sequence[int], usual: int) -> int:
-    """Return the index of the part of a scan to fit: ``usual``, or the part with the most measured pixels if
-    the usual part has too few. ``counts`` contains the number of measured pixels of each part.
+    """Choose which part of a scan is fitted, and return the index of this part. The part ``usual`` is fitted
+    if it has enough measured pixels, and otherwise the part with the most measured pixels. ``counts``
+    contains the number of measured pixels of each part.
     """
     enough = counts[usual] >= min(FEWEST_PIXELS, max(counts))
     return usual if enough else int(np.argmax(counts))

@@ -38,7 +38,8 @@ class FitFacts(Record):
     """Facts about a fit: the number of parameters of the model, the ids of its training and validation scans,
     and the duration of the fit.
 
-    ``at_bounds`` maps the name of each fitted value that lies on a bound of its range to this bound.
+    ``at_bounds`` contains the fitted values that lie on a bound of their range, as a dict from the name of
+    the value to the bound.
     """
 
     parameters: int
@@ -67,8 +68,8 @@ def fit(
         model_name: a name in ``litho_models.models.MODELS``.
         scans: training scans, all with the same pitch, level height and number of levels.
         config: settings of the training and of the model.
-        checkpoint: folder for checkpoints. If the folder holds the checkpoint of an interrupted run, this run
-            continues.
+        checkpoint: folder for checkpoints. If the folder holds the checkpoint of an interrupted run, the
+            interrupted run is continued.
 
     Raises:
         InputError: the model is unknown; there are no scans, or their pitch, level height or number of levels

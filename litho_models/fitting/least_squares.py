@@ -1,5 +1,5 @@
-"""Fit small models by a damped Gauss-Newton method. The terms of each scan are solved for together with the
-parameters of the model.
+"""Fit small models by a damped Gauss-Newton method. The terms of each scan and the parameters of the model
+are found together.
 
 The loss is a sum of squared or of absolute residuals r. To minimise absolute residuals, squared residuals are
 minimised with the weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals of a model and their
@@ -26,7 +26,8 @@ Room = tuple[Array, Array]
 # measured print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
-# A combination of normalised columns whose squared norm is below this value is regarded as rounding error.
+# If the squared norm of a combination of normalised columns is below this value, the combination is regarded
+# as a rounding error. The value is also added to the diagonal of a matrix that may be singular.
 _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
@@ -69,12 +70,11 @@ class Rules:
     Attributes:
         loss: ``absolute`` to minimise the sum of absolute residuals, ``squares`` to minimise the sum of
             squared residuals.
-        term_weight: weight, with the loss ``squares``, of the part of a residual that the terms of the scan
-            can explain. The weight is large enough to determine the part of these terms that is common to all
-            scans (the common datum). The weight is small enough that the terms of a single scan do not bias
-            the parameters.
-        pinned: number of scan terms, with the loss ``absolute``, whose mean over the scans is held at zero.
-            The pinned terms are the first rows of ``Linearised.basis``.
+        term_weight: weight of the part of a residual that the terms of the scan can explain. It is used with
+            the loss ``squares``. The weight is not zero, so the fit determines the common datum of all scans.
+            The weight is small, so the terms of a single scan do not bias the parameters.
+        pinned: number of pinned terms. The mean of a pinned term over the scans is held at zero. Pinned terms
+            are used with the loss ``absolute`` and are the first rows of ``Linearised.basis``.
         steps: largest number of steps.
         relative_gain: the fit ends after a step that reduces the loss by less than this fraction of the loss.
         tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
@@ -232,23 +232,23 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """Return the reduction of the sum of squares that the normal equations predict for a step. ``matrix`` has
-    shape (p, p); ``right`` and ``step`` have shape (p,).
+    """Return the predicted reduction of the sum of squares by a step, according to the normal equations.
+    ``matrix`` has shape (p, p); ``right`` and ``step`` have shape (p,).
     """
     return float(2 * right @ step - step @ matrix @ step)
 
 
 def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[Linearised]:
-    """Return the linearised scans with the residuals in ``left`` (µm, one array of shape (n,) per scan) and
-    unchanged derivatives.
+    """Replace the residuals of linearised scans by the arrays in ``left`` (µm, one array of shape (n,) per
+    scan). The derivatives stay unchanged.
     """
     return [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
 
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
     """Eliminate the per-scan terms from the normal equations of one scan. Return the remaining normal matrix,
-    the right side and the weighted sum of squared residuals. The part of each column that the terms of the
-    scan can explain is multiplied by the weight ``term_weight``.
+    the right side and the weighted sum of squared residuals. In the inner products, the part of each column
+    that the terms of the scan can explain has the weight ``term_weight``.
     """
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])

@@ -41,8 +41,8 @@ def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> 
 
     Args:
         model: the model to fit; ``scans``: training scans.
-        policy: names the terms that are fitted to each scan. Line offsets are left out of the fit, because
-            they average out over a scan.
+        policy: name of the set of terms that are fitted to each scan. Line offsets are left out of the fit,
+            because they average out over a scan.
     """
     if not model.weights.requires_grad:
         return

@@ -156,14 +156,15 @@ def training_config(
 
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return, for each level, the share of pixels, over all scans, at which the layout has this level."""
+    """Return, for each level, the share of pixels with this level in the layouts of all scans."""
     levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
     return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
 
 
 def step_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return, for each level difference 0, 1, 2 and so on, the share of pairs of neighbouring pixels that
-    have this difference. Pairs along rows and pairs along columns are counted together.
+    """Compute the level difference of every pair of neighbouring layout pixels. Return the shares of the
+    pairs with the differences 0, 1, 2 and so on. Pairs along rows and pairs along columns are counted
+    together.
     """
     steps = np.concatenate(
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]

@@ -1,4 +1,6 @@
-"""Fit small models to one window of each scan by least squares. Derivatives are computed in forward mode."""
+"""Fit small models to one window of each scan by least squares. Derivatives are computed by forward-mode
+differentiation.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -150,8 +152,8 @@ class _Sample:
 
 
 def _corner(scan: PrintedScan, usual: int) -> Window:
-    """Return the window that is fitted, in one of the four corners of a scan. ``usual`` is the number of the
-    corner to use if it has enough measured pixels.
+    """Return the window of a scan that is fitted. The window lies in corner number ``usual`` of the four
+    corners or, if this corner has too few measured pixels, in the corner with the most measured pixels.
     """
     size = min(WINDOW_PX, *scan.shape)
     last_y, last_x = (length - size for length in scan.shape)
@@ -194,7 +196,7 @@ def load_numbers(model: nn.Module, vector: Array) -> None:
 
 class _WindowPrediction(nn.Module):
     """A torch module that calls ``sample.predict``. For forward-mode derivatives, torch must replace the
-    parameters of the model, which is possible only if the call is itself a module.
+    parameters of the model. Torch can do so only if the call is itself a module.
     """
 
     def __init__(self, model: Simulator, sample: _Sample):
