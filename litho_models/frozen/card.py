@@ -31,8 +31,9 @@ _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported error or other value. ``split``, ``policy`` and ``background`` say on which scans the
-    value was computed, which nuisance terms were fitted and which background was added.
+    """One reported error or other value. ``split`` states the scans on which the value was computed,
+    ``policy`` the nuisance terms that were fitted, and ``background`` the background that was added to the
+    predictions.
 
     ``ci95`` is the 95 % confidence interval of the value, from resampling scans.
     """
@@ -58,11 +59,12 @@ class ModelCard(RunFacts, Result):
 
     ``background`` is the mean contribution of the microscope to the training scans. This background is used
     only for comparisons with measured heights and is never part of the height that the model predicts.
-    ``at_bounds`` maps the name of each fitted value that lies on a bound of its range to this bound.
-    ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on which the model was
-    trained; ``litho-models check`` compares new prints with these values. For some effects, the measurements
-    do not determine whether they arise in the printer or in the microscope. ``attributed`` maps the name of
-    each such effect to the side (printer or microscope) to which it was attributed when the model was frozen.
+    ``at_bounds`` contains the fitted values that lie on a bound of their range, as a dict from the name of
+    the value to the bound. ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on
+    which the model was trained; ``litho-models check`` compares new prints with these values. For some
+    effects, the measurements do not show whether the printer or the microscope causes the effect. Such an
+    effect can be attributed to one side when the model is frozen. ``attributed`` maps the name of the effect
+    to this side.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)

@@ -76,8 +76,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 
 
 class _Numbers(TorchDispatchMode):
-    """A torch mode that records the Python numbers which a model reads from tensors with ``Tensor.item`` in
-    one run, and returns the same numbers in a second run.
+    """A torch mode for two runs of a model. In the first run, it records the Python numbers that the model
+    reads from tensors with ``Tensor.item``. In the second run, it returns the same numbers.
 
     These numbers are the radii of blur kernels and the end points of tables. Radii and end points depend only
     on the weights, so the exported program may contain them as constants.

@@ -1,4 +1,6 @@
-"""Freeze a process model, i.e. save the model that a training or a closed loop wrote as a frozen model."""
+"""Freeze a process model: load the model that a training or a closed loop wrote, and save it as a frozen
+model.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,8 +37,8 @@ def freeze(
             all of these effects, or a mapping from the name of an effect to its side. Effects attributed to
             the printer become part of the frozen model; those attributed to the microscope do not. The card
             records the attribution. The name ``scan-axis`` stands for the part of a base model that acts
-            along the lines of the scan. If the frozen model does not contain this part, the card states no
-            background and no baseline.
+            along the lines of the scan. If this part of the base model is left out, the card of the frozen
+            model states no background and no baseline.
 
     Raises:
         InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a side

@@ -16,7 +16,7 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """Return the folder of a model. A model that the cache of huggingface_hub does not contain is downloaded
+    """Return the folder of a model. If the model is not in the cache of huggingface_hub, it is downloaded
     first.
 
     Args:

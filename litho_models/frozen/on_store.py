@@ -20,8 +20,8 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     """Predict the print of a layout file, and write its height to ``out``. Return the height in µm, as an
     array of shape (ny, nx), and a phrase that says what was assumed beyond the edge of the layout.
 
-    A file that ``litho-design`` exported contains an element that stands alone on the substrate, as in the
-    design, so level 0 surrounds it. Every other layout is continued by its outermost levels.
+    A file that ``litho-design`` exported contains an element that stands alone on the substrate, so level 0
+    is assumed beyond its edge. Every other layout is continued by repeating its outermost pixels.
 
     Args:
         layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. The file contains the level
@@ -78,8 +78,8 @@ def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
 
 
 def locked_scans(model: FrozenSimulator, dataset: Store) -> list[str]:
-    """Return the sorted ids of the scans in a store that count as locked for a model: those that the store
-    locks, and those that were locked when the model was trained.
+    """Return the sorted ids of the scans in a store that count as locked for a model: the scans that the
+    store locks, and the scans that were locked when the model was trained.
     """
     return sorted({*dataset.locked_ids, *locked_by_the_card(model, dataset)})
 
@@ -88,10 +88,10 @@ def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """Return the ids of the scans in a store that were locked when the model was trained. The scans are
     recognised by their raw files.
 
-    Raw files are compared because they stay the same if the store is built anew. Heights and lock boxes may
-    change: other settings for levelling or registration change every height in the store, and an added or
-    missing scan changes which scans the store locks. If the card lists no raw files, the function returns the
-    ids of locked scans that the card names, but only if the dataset has the same name.
+    Raw files are compared because they stay the same if the store is built anew. Heights change if the
+    settings for levelling or registration change, and the choice of locked scans changes if scans are added
+    to the store or removed from it. If the card lists no raw files, the scans are recognised by their ids
+    instead, but only if the store has the dataset name that the card states.
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):

@@ -87,7 +87,7 @@ class FrozenSimulator(nn.Module):
         """Context manager for a block in which the model predicts in the given precision (see
         ``network_precision``). Outside such a block, the model predicts in float32.
 
-        If the given precision is slower than float32 on this processor, a warning on stderr says so.
+        If the given precision is slower than float32 on this processor, a warning is printed on stderr.
         """
         warn_where_slower(precision, next(self.parameters(), torch.empty(0)).device.type)
         before, self._precision = self._precision, precision

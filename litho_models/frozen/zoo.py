@@ -30,7 +30,7 @@ def folder(name: str) -> Path:
     smallest error on held-out scans.
 
     Raises:
-        InputError: no such model.
+        InputError: the zoo has no model with this name.
     """
     known = list()
     if name == BEST and known:
@@ -46,7 +46,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
     Args:
         source: path or name that the user typed.
-        other: further names that the caller accepts, which are only listed in the error message.
+        other: further names that the caller accepts. They are used only in the error message.
 
     Raises:
         InputError: there is no such folder, the zoo has no such model, or the model cannot be downloaded.
@@ -67,7 +67,7 @@ def card(name: str) -> dict[str, Any]:
     are not read.
 
     Raises:
-        InputError: no such model.
+        InputError: the zoo has no model with this name.
     """
     found: dict[str, Any] = json.loads((folder(name) / _CARD_FILE).read_text(encoding="utf-8"))
     return found
