@@ -30,8 +30,8 @@ _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
-# Rule for the radius of a kernel: either four sigma, or three times the value of sigma that is rounded down
-# to whole pixels. The latter is the rule in the code of the paper's authors.
+# Rule for the radius of a kernel: either four sigma, rounded up to whole pixels, or three times the whole
+# number of pixels in sigma. The code of the paper's authors uses the second rule.
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 

@@ -1,9 +1,10 @@
 """Ranges of fitted values, and the rule that decides whether a value counts as lying on a bound of its range.
 
-A fit does not change a value itself but a raw number without limits. The model uses the value inside the
-range that corresponds to the raw number. Near a bound, the value hardly changes with the raw number, so a fit
-that reached the bound could not leave it again. Fits therefore keep raw numbers between -``FLAT_FROM`` and
-``FLAT_FROM``. A value whose raw number has reached such a limit counts as lying on the bound.
+A fit does not change a value directly. The fit changes a raw number, and a formula converts this number to a
+value inside the range. Near a bound, the value hardly changes with the raw number, so a fit that came very
+close to the bound could not leave it again. Fits therefore keep the raw number above -``FLAT_FROM`` and, if
+the range has an upper bound, below ``FLAT_FROM``. A value whose raw number has reached such a limit counts as
+lying on the bound.
 """
 
 import math
@@ -36,13 +37,13 @@ class Range:
     upper: float = math.inf
 
     def value(self, raw: Tensor) -> Tensor:
-        """Return the value that the model uses for a raw number."""
+        """Return the value that corresponds to a raw number."""
         if math.isinf(self.upper):
             return self.lower + functional.softplus(raw)
         return self.lower + (self.upper - self.lower) * torch.sigmoid(raw)
 
     def raw(self, value: float) -> Tensor:
-        """Return the raw number for which the model uses this value.
+        """Return the raw number that corresponds to a value.
 
         Raises:
             InputError: the value is outside the range or on a bound.
@@ -62,8 +63,8 @@ class Range:
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """Return the bound on which the value that corresponds to a raw number lies. Return None if this
-        value lies on neither bound.
+        """Return the bound on which a value with this raw number lies. Return None if the value lies on
+        neither bound.
         """
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
