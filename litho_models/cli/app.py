@@ -233,7 +233,8 @@ def predict(
 ) -> None:
     """Predict the printed height of a layout. The layout must be sampled at the pitch of the model.
 
-    An exported element is surrounded by level 0. Any other layout is continued by its outermost levels.
+    An element that litho-design exported is surrounded by level 0. Any other layout is continued by repeating
+    its outermost pixels.
 
     Example: litho-models predict zoo:pbl layout.png --out height.gsf
     """
@@ -325,8 +326,8 @@ def freeze(
         ),
     ] = None,
 ) -> None:
-    """Freeze the process model of a run, without the measurement model. Its weights, its card (card.json) and
-    a page for readers (README.md) are written.
+    """Freeze the process model of a run, without the measurement model. Write the weights, the card
+    (card.json) and a page for readers (README.md) of the frozen model.
 
     Example: litho-models freeze run --out printer
     """
@@ -355,7 +356,7 @@ def main() -> None:
 
 
 def _training(words: Sequence[str] | None, **options: Any) -> dict[str, Any]:
-    """Combine the settings of a training that are given by options with those given by ``--set``."""
+    """Combine the training settings from ``--set`` with the training settings from other options."""
     found = assigned(words or ())
     if twice := sorted(found.keys() & options.keys()):
         raise InputError(

@@ -1,5 +1,5 @@
-"""The commands `litho-models board new` and `litho-models board judge`. The first makes stores with hidden
-causes. The second runs a loop on these stores and scores the causes that the loop names.
+"""The commands `litho-models board new` and `litho-models board judge`. `board new` makes stores with hidden
+causes. `board judge` runs a loop on these stores and scores the causes that the loop names.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def noise(
     ] = None,
     seed: Annotated[int, option("seed for the random choice of pixels", min=0)] = 0,
 ) -> None:
-    """Compute the roughness, the dose matrix, the noise budget and σ(x), the calibrated noise level at each
+    """Compute the roughness, the dose matrix, the noise budget, and the calibrated noise level σ(x) at each
     pixel. Lengths are in µm, noise in nm.
 
     Example: litho-models noise prints.zarr --residuals benchmark --out noise
