@@ -66,7 +66,7 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     layout. The height is differentiable in the layout.
 
     The border must be less than half as wide as the layout. The result equals the result of ``predict_field``
-    after the border is cropped. If the model allows it, only the pixels of the result are computed (see
+    without this border. If the model allows it, only the pixels of the result are computed (see
     ``FrozenSimulator.inside``).
     """
     reach = model.reach_px
@@ -95,7 +95,7 @@ def blend_tiles(
             computed.
 
     Raises:
-        InputError: an overlap of more than half a tile.
+        InputError: the overlap is more than half a tile.
     """
     size, overlap = tile
     stride = size - overlap
@@ -138,7 +138,7 @@ def blending_window(tile: Tile, like: Tensor) -> Tensor:
     tiles add up to one.
 
     Raises:
-        InputError: an overlap of more than half a tile.
+        InputError: the overlap is more than half a tile.
     """
     size, overlap = tile
     if not 0 <= 2 * overlap <= size:
