@@ -1,9 +1,9 @@
 """Divide scans into training scans and held-out scans. The locked scans are chosen elsewhere, in
 ``litho_data.store.lock_box``.
 
-Except in the split ``paper``, whole scans are held out, because the quadrants of one scan share its datum,
-the tip of the microscope and the day. Every choice follows from a hash of the scan ids and a seed, so the
-same ids and the same seed always give the same split.
+Except in the split ``paper``, whole scans are held out, because the quadrants of one scan have the same datum
+and were measured with the same tip on the same day. Every choice follows from a hash of the scan ids and a
+seed, so the same ids and the same seed always give the same split.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,8 @@ class ScoredSplit(Split):
     """A split, and the ids of the scans that were scored with it. ``lock_box_opened`` says whether any locked
     scan was scored.
 
-    ``first_folds`` is the number of folds that were fitted and scored, or None if all of them were.
+    ``first_folds`` is the number of folds that were fitted and scored, or None if all folds were fitted and
+    scored.
     """
 
     seed: int = 0
@@ -66,8 +67,8 @@ class Crop:
 
 @dataclass(frozen=True)
 class Fold:
-    """The scans on which models are trained and the held-out scans that they predict. ``locked`` is True if
-    the held-out scans are the locked scans.
+    """One fold: the training scans, and the held-out scans. Models trained on the training scans predict the
+    held-out scans. ``locked`` is True if the held-out scans are the locked scans.
     """
 
     number: int
@@ -128,8 +129,8 @@ def plan_folds(
 
 
 def grouped_folds(ids: Sequence[str], fields: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
-    """Divide scans into ``k`` folds, or into one per printed field if there are fewer fields. All scans of a
-    field are in the same fold. Return, for each fold, the ids of the scans that it holds out.
+    """Divide scans into ``k`` folds, or into one fold per printed field if there are fewer than ``k`` fields.
+    All scans of a field are in the same fold. Return, for each fold, the ids of the scans that it holds out.
 
     Args:
         ids: ids of the scans.
@@ -158,7 +159,7 @@ def grouped_folds(ids: Sequence[str], fields: Sequence[str], k: int = 5, seed: i
 
 def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:
     """Return one fold per print, in the order of the names of the prints. Each fold holds out all scans of
-    its print and is given as the list of their ids.
+    its print. It is given as the list of the ids of these scans.
 
     Raises:
         InputError: there are fewer than two prints, or an id is repeated.
@@ -190,8 +191,8 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Return the ids of the training scans that are set aside for selecting the best round of a training.
-    ``count`` scans are chosen, but at most a quarter of the training scans in ``ids``.
+    """Choose the training scans that are set aside to select the best round of a training, and return their
+    ids. ``count`` scans are chosen, but at most a quarter of the training scans in ``ids``.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))
