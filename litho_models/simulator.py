@@ -27,7 +27,7 @@ def spot_um(pitch_um: float) -> float:
     """Return the spot size (standard deviation, µm) from which a model derives its default lengths, given the
     pixel pitch of the layouts.
 
-    The result is ``FIRST_SPOT_UM`` if this length is between half a pixel and ten pixels. If it is not, the
+    The result is ``FIRST_SPOT_UM`` if this length is between half a pixel and ten pixels. Otherwise, the
     layouts are assumed to belong to another printer with a spot of two pixels.
     """
     low, high = _RESOLVED_PX
@@ -36,8 +36,8 @@ def spot_um(pitch_um: float) -> float:
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
     """Return the values of a model's length settings (such as blur widths), scaled to the spot size for the
-    given pitch. A length that ``set_`` contains is scaled from its value there, and any other length from its
-    default value. If the scale is 1, the returned dict is empty.
+    given pitch. For a length in ``set_``, the value in ``set_`` is scaled; for any other length, the default
+    value is scaled. If the scale is 1, the returned dict is empty.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
@@ -170,8 +170,8 @@ class Simulator(nn.Module, ABC):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Return the allowed ranges of the model's physical values. Each key is the name of a parameter,
-        which stores the physical value as one raw number without limits. Parameters that are not among the
+        """Return the allowed ranges of the model's physical values. Each key is the name of a parameter that
+        stores the physical value as one raw number (see ``layers.ranges``). Parameters that are not among the
         keys have no range.
         """
         return {}
