@@ -23,17 +23,17 @@ _LONGEST_PERIOD = 4096
 class ASMPropagator(KernelPropagator):
     """Propagate a complex field to a parallel plane by means of the transfer function of free space.
 
-    The transfer function is H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so
-    evanescent waves decay instead of becoming NaN. Because H is sampled, the propagated field is periodic.
-    The period is made long enough to keep the steepest rays from wrapping around, but at most 4096 pixels
-    long. Frequencies whose rays are too steep for the period are removed (after Matsushima and Shimobaba
-    2009, doi:10.1364/OE.17.019662). The kernel is stored only at the separations that occur between the two
-    grids, so a longer period costs nothing after construction. A negative distance propagates waves backwards
-    and drops the evanescent waves.
+    The transfer function is H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). For evanescent waves the root is
+    imaginary, so these waves decay. Because H is sampled, the propagated field is periodic. The period is
+    long enough that the steepest rays do not wrap around, but it never exceeds 4096 pixels. Frequencies whose
+    rays would still wrap around are removed (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662).
+    A longer period makes only the construction slower, because the kernel is stored only at the separations
+    that occur between the two grids. If the distance is negative, waves are propagated backwards and
+    evanescent waves are dropped.
 
-    Pixels larger than half a wavelength can represent only rays up to a certain angle, and the result is
-    exact for waves that contain only such rays. Smaller pixels admit rays up to grazing incidence. In this
-    case, 1 % of the wave behind a rough element is missing or wrapped around, so ``RSPropagator`` is the
+    Pixels larger than half a wavelength represent rays only up to a certain angle. For waves that contain
+    only such rays, the result is exact. Smaller pixels also represent rays close to grazing. With such
+    pixels, 1 % of the wave behind a rough element is missing or wrapped around, so ``RSPropagator`` is the
     better choice.
 
     Args:
@@ -72,9 +72,9 @@ class ASMPropagator(KernelPropagator):
 class SpectrumAxis:
     """One axis of the spectrum of a wave between two grids.
 
-    ``frequency`` contains the frequencies in cycles/µm, and ``inside`` is the mask of those that are not
-    removed. ``kept`` contains the indices of the kernel samples that are stored, and ``start_um`` is the
-    shift from the source grid to the target grid.
+    ``frequency`` contains the frequencies in cycles/µm, and ``inside`` is True at the frequencies that are
+    kept. ``kept`` contains the indices of the kernel samples that are stored, and ``start_um`` is the shift
+    from the source grid to the target grid.
     """
 
     frequency: Tensor
@@ -83,7 +83,7 @@ class SpectrumAxis:
     start_um: float
 
     def part(self, which: slice) -> SpectrumAxis:
-        """Return the axis restricted to the frequencies that a slice selects."""
+        """Return this axis with only those frequencies that the slice ``which`` selects."""
         return replace(self, frequency=self.frequency[which], inside=self.inside[which])
 
 
@@ -97,14 +97,15 @@ def spectrum_axes(
 
 def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wavelength_um: float) -> Tensor:
     """Return the transfer function of free space, complex128 of shape (y, x). It is 0 at frequencies whose
-    rays are too steep for the period of the field.
+    rays would wrap around.
     """
-    # Most frequencies occur with both signs, and only the shift depends on the sign.
+    # Most frequencies occur with both signs. Only the phase of the shift between the grids depends on the
+    # sign.
     (fy, row), (fx, column) = (torch.unique(axis.frequency.abs(), return_inverse=True) for axis in (y, x))
     squared = wavelength_um**-2 - fy[:, None] ** 2 - fx[None, :] ** 2
     wave = torch.exp(2j * math.pi * distance_um * torch.complex(squared, torch.zeros(()).double()).sqrt())
     if distance_um < 0:
-        # Backwards, evanescent waves grow until they overflow.
+        # If evanescent waves were propagated backwards, they would grow until they overflow.
         wave = torch.where(squared >= 0, wave, 0)
     along_y, along_x = (
         torch.exp(2j * math.pi * axis.start_um * axis.frequency) * axis.inside for axis in (y, x)
@@ -126,8 +127,8 @@ def _axis_band(
     middle = start + (there - here) * pitch / 2
     cosine = (1 - (wavelength_um * frequency) ** 2).clamp(min=0).sqrt()
     ray_shift = distance_um * wavelength_um * frequency
-    # A ray wraps around if it reaches a periodic copy of the target. Rays that are shifted sideways by no
-    # more than this distance, relative to the middle of the target, reach no copy.
+    # A ray wraps around if it reaches a periodic copy of the target. A ray reaches no copy if its sideways
+    # shift differs from ``middle`` by no more than this distance.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
     # At zero distance, all frequencies are kept, because propagation changes nothing.

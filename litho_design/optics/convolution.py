@@ -1,4 +1,4 @@
-"""Convolve by FFT. The convolution and its gradient compute only the samples that the result contains."""
+"""Convolve by FFT. Neither the convolution nor its gradient transforms rows that are cropped afterwards."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class KernelPropagator(nn.Module):
     Args:
         kernel: values of the kernel at the separations that ``wrapped_order`` returns, a complex128 array of
             shape (ky, kx).
-        finer: two pairs (along y, along x): the numbers of kernel pixels per source pixel, and the numbers of
-            kernel pixels per target pixel.
+        finer: number of kernel pixels per source pixel, and number of kernel pixels per target pixel. Each is
+            a pair (along y, along x).
         dtype: torch.complex64 or torch.complex128.
     """
 
@@ -47,9 +47,8 @@ class KernelPropagator(nn.Module):
         return found[..., :: there[0], :: there[1]]
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply P^H, the adjoint of ``forward``, which sends a field back.
-
-        It turns a complex field of shape (..., my, mx) into one of shape (..., ny, nx).
+        """Apply P^H, the adjoint of ``forward``, to a complex field of shape (..., my, mx). The result has
+        shape (..., ny, nx).
         """
         here, there = self._finer
         found = convolve(_spread(field, there), self.transfer.conj(), fine_shape(self.source.shape, here))
@@ -57,16 +56,16 @@ class KernelPropagator(nn.Module):
 
 
 def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int]:
-    """Return the shape of a finer grid that begins and ends at the same pixel centres as a grid of shape
-    ``shape``. ``finer`` states how many fine pixels fit into one coarse pixel along y and x.
+    """Return the shape of a finer grid whose first and last pixel centres coincide with those of a grid of
+    shape ``shape``. ``finer`` is the number of fine pixels per coarse pixel along y and x.
     """
     rows, columns = ((count - 1) * times + 1 for count, times in zip(shape, finer, strict=True))
     return rows, columns
 
 
 def wrapped_order(here: int, there: int) -> Tensor:
-    """Return the separations, in pixels, that occur between ``here`` source pixels and ``there`` target
-    pixels along an axis, in the order that an FFT needs.
+    """Return all separations, in pixels, between ``here`` source pixels and ``there`` target pixels along one
+    axis. They are in the order that an FFT needs.
 
     Negative separations come last. Unused entries repeat a used separation.
     """
@@ -92,11 +91,9 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 
 
 class _Convolution(torch.autograd.Function):
-    """A convolution with its gradient. The adjoint is a convolution with the conjugate transfer function,
-    with the shapes of input and output exchanged.
-
-    The gradient is implemented explicitly, because autograd would keep padded copies and transform rows that
-    are cropped afterwards.
+    """A convolution and its gradient. The gradient is computed by the adjoint, which is a convolution with
+    the conjugate transfer function. The gradient is implemented explicitly, because autograd would keep
+    padded copies of the field. It would also transform rows that are cropped afterwards.
     """
 
     @staticmethod

@@ -17,15 +17,14 @@ _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
-    """The convolution of an object with a PSF. The object and its image lie on the same frame of pixels.
+    """The convolution of an object with a PSF. The object and its image have the same pixels, which form the
+    frame. The object is dark outside the frame. The convolution does not wrap around.
 
-    The object is dark outside the frame. The operation is linear and does not wrap around.
-
-    The sides of the PSF are odd, and its middle sample is the origin, so an image is not shifted relative to
-    its object.
+    The number of pixels along each side of the PSF is odd. The middle pixel is the origin, so an image is not
+    shifted relative to its object.
 
     Args:
-        psf: real PSF of shape (k, k). Its sum need not be 1. Gradients flow to it.
+        psf: real PSF of shape (k, k). Its sum need not be 1. Gradients flow to the PSF.
         frame: shape (ny, nx) of the object and of the recorded image.
     """
 
@@ -34,8 +33,9 @@ class Blur:
         assert rows % 2 == columns % 2 == 1, "a PSF of odd sides has a middle sample"
         self._frame = frame
         # Pixel i receives from pixel j the PSF at i - j and, wrapped around, at i - j ± length. If the length
-        # is that of the frame plus half a PSF, the wrapped samples lie beyond the PSF. The array must also
-        # hold the PSF. The length is even, because a real transform of odd length takes nearly twice as long.
+        # is at least the frame plus half a PSF, the wrapped samples lie outside the PSF. The array must also
+        # be large enough to hold the PSF. The length is even, because a real transform of odd length takes
+        # nearly twice as long.
         lengths = (max(n + k // 2, k) for n, k in zip(frame, (rows, columns), strict=True))
         self._size = [2 * fast_length(-(-length // 2)) for length in lengths]
         middle_first = torch.nn.functional.pad(psf, (0, self._size[1] - columns, 0, self._size[0] - rows))
@@ -70,12 +70,12 @@ def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tens
 
     Each step replaces the estimate e by e * H^T (b / H e) / (H^T 1), where b is the recorded image and H is
     the blur by the PSF. The first estimate is flat and has the total light of the image (Richardson 1972,
-    Lucy 1974). Because of the division by H^T 1, the result is correct at the borders and for a PSF with any
-    sum. The estimate approaches the object itself, and sum(H e) = sum(b) after every step.
+    Lucy 1974). The division by H^T 1 makes the result correct at the borders and for a PSF whose sum is not
+    1. After every step, sum(H e) = sum(b).
 
     Args:
-        recorded: recorded image, shape (..., ny, nx). Negative values, which read noise causes, count as
-            dark.
+        recorded: recorded image, shape (..., ny, nx). Read noise may make some values negative; they are
+            treated as dark.
         psf: real PSF on the same pixels, shape (k, k) with odd k.
 
     Returns:

@@ -21,8 +21,8 @@ def make_propagator(
     specifies.
 
     The propagation ``auto`` uses the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter
-    distances, it uses the angular spectrum, whose period is then long enough without further padding.
-    ``far-field`` uses the distance as the focal length of an ideal lens.
+    distances, ``auto`` uses the angular spectrum. ``far-field`` uses the distance as the focal length of an
+    ideal lens.
 
     Raises:
         InputError: ``rayleigh-sommerfeld`` is requested at a distance below the sampling limit, or the
@@ -35,7 +35,7 @@ def make_propagator(
 
 
 def takes_spectrum(source: PixelGrid, target: PixelGrid, optics: Optics) -> bool:
-    """Return True if the angular spectrum is to be used, because it is requested or because the
+    """Return True if the settings request the angular spectrum, or if they request ``auto`` and the
     Rayleigh-Sommerfeld kernel would be aliased.
     """
     near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)

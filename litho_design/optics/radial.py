@@ -20,8 +20,9 @@ class RadialPropagator(nn.Module):
 
     The propagated field U(p) is a sum over all rings. Each ring contributes its field u times the integral of
     h over the ring, where h is the kernel in ``RSPropagator``. The integral over a ring uses two
-    Gauss-Legendre nodes across the ring and the midpoint rule around it. For a periodic integrand, the error
-    of the midpoint rule falls exponentially once the phase is resolved.
+    Gauss-Legendre nodes across the ring and the midpoint rule around it. The integrand is periodic around the
+    ring, so the error of the midpoint rule decreases exponentially with the number of steps, once these
+    resolve the phase.
 
     Args:
         rings: number of rings; ring i covers the radii from i to i + 1 times ``ring_width_um``.
@@ -87,8 +88,8 @@ def _ring_matrix(
 def _half_circle(
     source_radius_um: float, target_radius_um: Tensor, distance_um: float, wavelength_um: float
 ) -> tuple[Tensor, float]:
-    """Return the midpoints of equal steps between the angles 0 and pi, and the size of a step. The steps
-    resolve the fastest phase change around any ring.
+    """Return the midpoints of equal steps between the angles 0 and pi, and the size of a step. The steps are
+    small enough to resolve the fastest change of the phase around any ring.
     """
     target = float(target_radius_um.max())
     far = math.hypot(source_radius_um + target, distance_um)

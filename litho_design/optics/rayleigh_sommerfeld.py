@@ -24,8 +24,8 @@ class RSPropagator(KernelPropagator):
     U(p) = sum over source pixels q of u(q) h(p - q) dy dx, with h = z / (2 pi r^2) (1/r - j k) exp(j k r),
     r^2 = x^2 + y^2 + z^2 and k = 2 pi / wavelength. In the time convention used here, exp(+j k r) is a wave
     that runs outwards (Goodman, Fourier Optics, ch. 3). The sum is computed exactly, because the kernel
-    covers all separations between the two grids. If the two pitches differ, their ratio must be a ratio of
-    small integers; the kernel is then sampled at the largest pitch that divides both.
+    covers all separations between the two grids. If the two pitches differ, they must be in a ratio of small
+    integers. The kernel is then sampled at the largest pitch of which both are multiples.
 
     Args:
         source, target: grids of the two planes, with origin and pitch in µm.
@@ -69,10 +69,9 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Return the two numbers of equal parts into which the first and the second pitch must be divided, so
-    that all parts have the same length. ``pitches`` is the ratio of the second pitch to the first.
-
-    Return None if too many parts are needed.
+    """Return two integers: the number of fine pixels per pixel of the first grid, and per pixel of the second
+    grid, for the coarsest fine grid that suits both. ``pitches`` is the second pitch divided by the first.
+    Return None if one of the integers would exceed 16.
     """
     found = Fraction(pitches).limit_denominator(_LARGEST_RATIO)
     if found.numerator > _LARGEST_RATIO or abs(found / Fraction(pitches) - 1) > 1e-12:

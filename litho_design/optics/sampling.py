@@ -11,7 +11,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 
 # Sampling creates a copy of the spectrum around the frequency 1/pitch. The intensity of the evanescent wave
-# at this frequency must decay by the factor exp(-2 pi n), where n is this number; 4e-6 of it then remains.
+# at this frequency must decay by the factor exp(-2 pi n), where n is the number below. For n = 2, this factor
+# is 4e-6.
 _DECAY_LENGTHS = 2.0
 
 
@@ -30,8 +31,8 @@ def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float
     """Return the smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
 
     At a distance x from the axis, the kernel oscillates with x / (wavelength r) cycles/µm. This must stay
-    below the Nyquist frequency of the source grid. Close to the axis, the evanescent waves in the copies of
-    the spectrum that sampling causes must have decayed.
+    below the Nyquist frequency of the source grid. Sampling also creates copies of the spectrum. The
+    evanescent waves in these copies must have decayed, which sets a second limit on the distance.
     """
     limit = 0.0
     for axis in range(2):
@@ -61,7 +62,7 @@ def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wav
 
 
 def fast_length(length: int) -> int:
-    """Return the smallest size of at least ``length`` for which the FFT is fast (factors 2, 3 and 5 only)."""
+    """Return the smallest size >= ``length`` with a fast FFT (no prime factors except 2, 3 and 5)."""
     from scipy.fft import next_fast_len  # imported late to save the command line a tenth of a second
 
     found: int = next_fast_len(length, real=True)

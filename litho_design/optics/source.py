@@ -9,8 +9,8 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_design.optics.thin_element import Optics
 
-# Number of directions per area (wavelength / side of the element)^2 in the plane of direction sines, where
-# the source covers a disc. The directions lie closer together than an element can resolve.
+# Number of directions per area (wavelength / side of the element)^2. The source covers a disc in the plane of
+# the direction sines. The directions lie closer together than an element can resolve.
 _POINTS_PER_AREA = 3
 _FEWEST = 8
 _MOST = 128
@@ -20,11 +20,12 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
     """Return monochromatic plane waves whose images add up to the image of the source.
 
-    For each wave, the result contains a pair: its share of the light, and the optics with its wavelength and
-    direction. The wavelengths are the nodes of a Gauss-Hermite quadrature over a Gaussian spectrum.
-    Directions are spread evenly over a disc of sines around the direction of ``optics``. The images of
-    neighbouring waves lie closer together than lambda z / D, the finest detail of an element of side D. For a
-    monochromatic point source, there is only one wave, with the given ``optics``.
+    The result contains one pair for each plane wave: the share of the light in this wave, and a copy of
+    ``optics`` with the wavelength and direction of this wave. The wavelengths are the nodes of a
+    Gauss-Hermite quadrature over a Gaussian spectrum. The sines of the directions along x and y are spread
+    evenly over a disc, whose centre is the direction of ``optics``. The images of neighbouring waves lie
+    closer together than lambda z / D, the finest detail of an element of side D. For a monochromatic point
+    source, there is only one wave, with the given ``optics``.
 
     Args:
         size_um: side of the element.

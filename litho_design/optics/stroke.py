@@ -15,8 +15,8 @@ class Stroke(Record):
     """Printed heights of the levels, and the efficiencies of a blazed grating whose periods consist of these
     levels.
 
-    ``print_gain`` is the printed height range divided by the nominal one. The number of levels and the height
-    that would make the stroke one wave are None if this gain is not positive.
+    ``print_gain`` is the printed height range divided by the nominal one. If this gain is not positive,
+    ``levels_for_one_wave`` and ``level_height_for_one_wave_um`` are None.
     """
 
     printed_height_um: list[float]
@@ -31,15 +31,15 @@ class Stroke(Record):
 
 def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
     """Return the efficiency, according to scalar theory, of a blazed grating whose periods consist of
-    ``steps`` equal steps and whose stroke is ``gain`` waves. The heights of the steps are k ``gain`` /
-    ``steps`` waves, where k runs from 0 to ``steps`` - 1.
+    ``steps`` equal steps. The height of step k is k ``gain`` / ``steps`` waves, where k runs from 0 to
+    ``steps`` - 1.
     """
     return staircase_efficiency([gain * step / steps for step in range(steps)], order)
 
 
 def staircase_efficiency(waves: Sequence[float], order: int) -> float:
     """Return the efficiency, according to scalar theory, of a grating whose periods consist of N steps of
-    equal width and of the given heights in waves.
+    equal width. ``waves`` contains the heights of the steps, expressed as phase delays in waves.
 
     eta_m = sinc^2(m/N) |mean over k of exp(2 pi j (w_k - m k/N))|^2, where m is the order and w_k is the
     height of step k.
@@ -63,8 +63,8 @@ def measure_stroke(
 
     Returns:
         The stroke, and the efficiency of a blazed grating with these levels in the first and the zero order.
-        The record also states two ways to make the stroke one wave: the number of levels if their height is
-        kept, and the height of a level if the number of levels is kept.
+        The record also states what would make the stroke one wave: another number of levels of the same
+        height, or the same number of levels of another height.
     """
     count = len(printed_height_um)
     stroke_um = printed_height_um[-1] - printed_height_um[0]

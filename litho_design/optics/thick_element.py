@@ -1,4 +1,4 @@
-"""The wave propagation method, which sends light through a relief of finite height, slice by slice."""
+"""The wave propagation method, which computes the passage of light through a relief slice by slice."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def wave_through_relief(
     doi:10.1364/AO.32.004984). If the surface crosses a pixel within the slice, the two waves are mixed in
     proportion to the shares of resist and air, so that gradients flow. One reflection at normal incidence is
     included: a share (n - 1)^2 / (n + 1)^2 of the light is lost. The result is propagated back through air to
-    the foot, where a thin element would be. The field is treated as periodic, i.e. light that leaves on one
-    side enters on the other.
+    the foot, where a thin element would be. The field is treated as periodic: light that leaves on one side
+    enters again on the other side.
 
     Args:
         field: complex wave at the foot of the relief, inside the resist, shape (..., ny, nx).

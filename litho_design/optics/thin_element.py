@@ -14,8 +14,8 @@ ElementKind = Literal["thin", "thick"]
 
 # Range of valid wavelengths. A value outside this range was probably given in metres or nanometres.
 SHORTEST_UM, LONGEST_UM = 0.05, 100.0
-# Width, µm, of the dark border that is added around a thick element. While light passes through a relief, it
-# spreads sideways by no more than this.
+# Width, µm, of the dark border that is added around a thick element. Light that passes through a relief
+# spreads sideways by no more than this width.
 _BORDER_UM = 2.0
 
 if TYPE_CHECKING:
@@ -96,8 +96,8 @@ class Optics(Record):
         return self.model_copy(update={"wavelength_um": wavelength_um, "index_step": step})
 
     def oblique_path_um(self, y_um: Tensor, x_um: Tensor) -> Tensor:
-        """Return the extra path of oblique light to given positions, relative to the axis, µm. It is 0 for
-        light along the axis.
+        """Return by how much the path of oblique light to the given positions exceeds its path to the axis,
+        µm. The result is 0 for light along the axis.
         """
         return self.incidence_x * x_um + self.incidence_y * y_um
 
@@ -123,8 +123,8 @@ def check_incidence(grid: PixelGrid, optics: Optics) -> None:
     sine of the ray from this source.
 
     Raises:
-        InputError: along one axis, the sine reaches wavelength / (2 pitch), above which the sampled wave goes
-            in another direction; or the sine over both axes reaches 1.
+        InputError: the sine along x or y reaches wavelength / (2 pitch), above which the sampled wave would
+            have another direction; or the sine of the whole angle of incidence reaches 1.
     """
     farthest_um = [float(abs(axis).max()) for axis in (grid.y_um, grid.x_um)]
     distance_um = optics.source_distance_um
@@ -149,7 +149,8 @@ def known_height(height_um: Tensor | np.ndarray, like: Tensor) -> Tensor:
     dtype of ``like``.
 
     Raises:
-        InputError: the heights are not numbers, or some are missing, as in a scan.
+        InputError: the heights are not numbers, or some heights are missing (NaN), as may be the case in a
+            scan.
     """
     import numpy as np
     import torch  # imported late, as in `element_field`
@@ -185,10 +186,10 @@ def element_field(
     """Return the wave just behind a phase element that is illuminated by a plane wave of unit power.
 
     The wave is u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
-    elsewhere. If the optics have a Gaussian beam or a near point source, the wave also has the amplitude of
-    the beam or the phase of the source. The wave is scaled so that sum |u|^2 dy dx = 1. Intensities summed
-    over any window, times the pixel area, are therefore shares of the incident power. For a thick element in
-    air, ``wave_through_relief`` replaces the phase.
+    elsewhere. For a Gaussian beam, u is multiplied by the amplitude of the beam; for a near point source, the
+    phase of its spherical wave is added. The wave is scaled so that sum |u|^2 dy dx = 1. The sum of |u|^2 dy
+    dx over a window is therefore a share of the incident power. For a thick element in air,
+    ``wave_through_relief`` replaces the phase delay of the heights.
 
     Args:
         height_um: printed heights, µm, shape (..., ny, nx).
@@ -239,7 +240,8 @@ def flat_field(grid: PixelGrid, optics: Optics, *, pixels: int | None = None) ->
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
-    """Return the wave behind a thick element in air that is illuminated by ``field``, shape (..., ny, nx).
+    """Return the wave, shape (..., ny, nx), behind a thick element in air. ``field`` is the wave that
+    illuminates the element.
 
     The surroundings of the element are dark.
     """
@@ -247,7 +249,7 @@ def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Op
 
     from litho_design.optics.thick_element import wave_through_relief
 
-    # The surroundings are dark, so that light that leaves on one side does not enter on the other.
+    # A dark border is added, so that light that leaves on one side does not enter on the other.
     border = (math.ceil(_BORDER_UM / pitch_um),) * 4
     dark = torch.nn.functional.pad(field, border)
     relief = torch.nn.functional.pad(height_um - height_um.amin(), border)
