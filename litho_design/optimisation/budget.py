@@ -46,7 +46,7 @@ def measure_budget(
     search: SearchSettings,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Budget:
-    """Time one iteration with gradients and one without, at the current parameters, which stay unchanged."""
+    """Time one iteration with gradients and one without gradients. The parameters stay unchanged."""
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
     started = clock()

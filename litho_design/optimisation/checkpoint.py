@@ -17,7 +17,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_design.optimisation.ranks import Ranks
 
-# Exceptions that torch may raise for a damaged file; which of them depends on the position of the damage.
+# Exceptions that torch may raise for a damaged file. Which one it raises depends on the position of the
+# damage.
 _DAMAGED = (
     RuntimeError,
     pickle.UnpicklingError,
@@ -31,7 +32,7 @@ _DAMAGED = (
 
 @dataclass
 class SearchState:
-    """The state of a search. A search resumes from this state, its settings, and the states of its parts,
+    """The state of a search. To resume, a search needs this state, its settings, and the states of its parts,
     such as the optimiser.
     """
 
@@ -61,8 +62,9 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, fingerprint: str, stateful: Mapping[str, Any], device: torch.device
 ) -> SearchState:
-    """Load a checkpoint. The saved states are loaded into the objects in ``stateful``, such as the optimiser,
-    which are changed in place. The state of the search is returned, with its tensors on ``device``.
+    """Load a checkpoint and return the state of the search, with its tensors on ``device``. The states of the
+    parts are loaded into the objects in ``stateful``, such as the optimiser, and change these objects in
+    place.
 
     Raises:
         InputError: the checkpoint belongs to another task, or the file is damaged.

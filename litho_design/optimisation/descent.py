@@ -11,7 +11,7 @@ from torch import Tensor
 T = TypeVar("T")
 
 
-# Descent needs gradients even if the caller disabled them, as most scores do.
+# The descent needs gradients, but most functions that compute scores disable them.
 @torch.enable_grad()
 def descended(
     free: Iterable[Tensor],
@@ -21,13 +21,12 @@ def descended(
     iterations: int,
     project: Callable[[], object] = lambda: None,
 ) -> tuple[T, float]:
-    """Minimise a loss by Adam. Return the result that belongs to the step with the lowest loss, and this
-    loss.
+    """Minimise a loss by Adam. Return a pair: the result of the step with the lowest loss, and this loss.
 
     Args:
         free: the tensors whose values are changed, in place.
-        loss: function that returns the loss at the current values, and a result. Later steps must not change
-            this result.
+        loss: function that returns the loss at the current values, and a result computed from these values.
+            Later steps must not change this result.
         project: function that is called after every step, to bring the values back into their range.
     """
     optimiser = torch.optim.Adam(free, lr=rate)

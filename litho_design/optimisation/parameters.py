@@ -1,5 +1,5 @@
-"""The free parameters of a layout of cells or rings. They are either Gumbel-Softmax distributions over
-levels, or one real-valued level per cell, which is rounded for the print.
+"""The free parameters of a layout of cells or rings. Each cell has either a Gumbel-Softmax distribution over
+levels, or one real-valued level, which is rounded for the print.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 # With 13 levels (12 steps between them), a learning rate of 1 moves the level of a cell by about one level
-# per iteration. With another number of levels, it moves the level by the same share of the range.
+# per iteration. With another number of levels, this rate moves the level by the same share of the range.
 _RATE_STEPS = 12
 # Width of the distributions at the start, in levels. With this width, the first step of the search can reach
 # the levels next to the starting level.
@@ -169,8 +169,8 @@ class DirectLevels(nn.Module):
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Return the levels clamped to their range, because an optimiser step that is not followed by
-        ``project`` may leave this range.
+        """Return the levels clamped to their range. A step of the optimiser may move levels out of this
+        range, and ``project`` need not follow.
         """
         return self._filtered().clamp(0, self.levels - 1)
 
@@ -184,11 +184,11 @@ Parametrisation = GumbelLevels | DirectLevels
 def make_parametrisation(
     layout: LayoutSettings, search: SearchSettings, cells: CellMap | None = None
 ) -> Parametrisation:
-    """Make free parameters of the kind that ``search.parametrisation`` names. ``cells`` may cover only a part
-    of the layout.
+    """Make the free parameters: ``GumbelLevels`` or ``DirectLevels``, as ``search.parametrisation`` says.
+    ``cells`` may cover only a part of the layout.
 
     Raises:
-        InputError: a filter over cells is requested for distributions over levels.
+        InputError: the layout has a cell filter, but the parameters are distributions over levels.
     """
     if search.parametrisation == "direct":
         return DirectLevels(layout, cells)

@@ -14,12 +14,13 @@ from torch import Tensor
 from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import CellMap
 
-# Below this amplitude, relative to that behind the element, a wave is treated as having no phase.
+# A wave is treated as having no phase if its amplitude is below this share of the amplitude behind the
+# element.
 _DARK = 1e-12
 # The starting phases are drawn from a range of plus or minus this value, in radians. If phases were drawn
-# from the whole circle, one in six pairs of neighbouring cells would end more than half a wave apart.
-# Printing rounds off such a step, and the search does not repair it. This narrower range leads to a third
-# fewer of these steps, and different seeds still give different results.
+# from the whole circle, the phases of one in six pairs of neighbouring cells would finally differ by more
+# than half a wave. Printing rounds off such a large step, and the search does not remove it. The narrower
+# range reduces the number of large steps by a third, and different seeds still give different results.
 _START_PHASE_RAD = 1.0
 
 
@@ -40,14 +41,14 @@ def gerchberg_saxton(
 
     Each step replaces the propagated amplitude inside the output window by the target amplitude and keeps the
     wave outside the window unchanged. The adjoint of the propagator carries this correction back to the
-    element, and the corrected wave is projected onto the waves that phases of the cells can produce in the
-    given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P is the
-    propagator, ``a`` is the target amplitude, and Pi is the projection. The norm of P is at most one, so each
-    step minimises an upper bound of the squared amplitude error, and the error never rises (Gerchberg and
-    Saxton 1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target
-    amplitude where light is missing. This form improves uniformity but loses the guarantee that the error
-    never rises. The initial phases are drawn at random within one radian of pi. The phase pi is the middle of
-    the range if the levels span a full wave.
+    element, and the corrected wave is projected onto the waves that an element with one phase per cell can
+    produce in the given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the
+    element, P is the propagator, ``a`` is the target amplitude, and Pi is the projection. The norm of P is at
+    most one, so each step minimises an upper bound of the squared amplitude error, and the error never rises
+    (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises
+    the target amplitude where light is missing. With this form, the image is more uniform, but the error may
+    rise. The initial phases are drawn at random within one radian of pi. If the levels span a full wave, pi
+    is the middle of their range.
 
     Args:
         propagator: propagator with an adjoint, such as ``RSPropagator``, on square grids with the pixel pitch
@@ -58,13 +59,13 @@ def gerchberg_saxton(
         counted: boolean mask, shape (size, size), of the pixels whose amplitude is prescribed. On other
             pixels, the wave is kept as it is. If a mask is given, the target amplitude is scaled to the light
             on the pixels of the mask.
-        level_phase: printed phase of each level, in radians, shape (levels,). If given, the second half of
-            the iterations projects on these phases instead of on the whole circle.
+        level_phase: printed phase of each level, in radians, shape (levels,). If given, only these phases are
+            allowed in the projections of the second half of the iterations.
         total: function that sums values over the pixels of the whole element. It is needed only if ``cells``
             and ``target`` cover just a part of the element.
 
     Returns:
-        The phase of each cell, in radians, and a list of the amplitude errors sqrt(sum (|P u| - a)^2) before
+        The phase of each cell, in radians, and a list of the amplitude error sqrt(sum (|P u| - a)^2) before
         each step.
     """
     add = total or torch.sum
@@ -78,8 +79,8 @@ def gerchberg_saxton(
     amplitude = target.clamp(min=0).sqrt()
     incident = math.sqrt(math.prod(propagator.source.shape) * math.prod(propagator.source.pitch_um))
     area = math.prod(propagator.target.pitch_um)
-    # The light is scaled to a mean square of 1. It is rounded last, so that a plane wave along the axis is
-    # exactly 1.
+    # The light is scaled to a mean square of 1. It is rounded after the scaling, so that a plane wave along
+    # the axis is exactly 1.
     light = illumination.to(target.device, torch.complex128)
     light = light * (math.sqrt(math.prod(propagator.source.shape)) / norm(light.abs()))
     light = light.to(target.dtype.to_complex())
@@ -122,12 +123,13 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels whose printed phases are nearest to the phase of a lens. Before the levels are
-    chosen, the constant phase that loses the least light is added to the phase of the lens.
+    """Return the levels whose printed phases are nearest to the phase of a lens. First, a constant is added
+    to the phase of the lens, namely the constant with which the least light is lost.
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
-    phase decides which cells fall into this gap. Each constant is judged by the amplitude at the focus, i.e.
-    by the mean of exp(j error) over the cells.
+    determines which cells have phases in this gap. 24 constants are tried, and the one with the largest
+    amplitude at the focus is used. This amplitude is the mean of exp(j (printed phase - phase of the lens))
+    over the cells.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):

@@ -20,16 +20,15 @@ _FIRST_SHARE = 0.02
 def polish_levels(
     levels: Tensor, cells: CellMap, objective: Objective, *, level_count: int, rounds: int
 ) -> tuple[Tensor, list[float]]:
-    """Improve an integer layout by moving cells up or down by one level. The loss never rises.
-
-    The gradient at the integer layout ranks the moves. In each round, the levels of a share of the cells,
-    those with the best moves, are changed at once. If the true loss of the changed layout is not lower, the
-    changes are discarded and this share is halved.
+    """Improve an integer layout by changing the levels of cells by one. The loss never rises. The gradient of
+    the loss predicts how much each change would lower the loss. In each round, the best changes, for a
+    certain share of the cells, are made together. If the loss of the changed layout is not lower, the changes
+    are discarded and this share is halved.
 
     Args:
         levels: level of each cell, an int64 tensor with one value per cell.
         level_count: number of printable levels.
-        rounds: number of rounds. Each round evaluates the loss and its gradient once.
+        rounds: largest number of rounds. Each round evaluates the loss and its gradient once.
 
     Returns:
         The improved levels in the same form, and a list of the losses at the start and after each accepted
@@ -57,11 +56,11 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """Estimate, to first order, how much the loss falls if a single cell moves by one level in the better
+    """Estimate, to first order, how much the loss falls if the level of one cell changes by one in the better
     direction.
 
     Returns:
-        The decrease of the loss for each cell, the move of each cell (-1 or +1), and the loss of the
+        The decrease of the loss for each cell, the change of its level (-1 or +1), and the loss of the
         unchanged layout.
     """
     values = levels.float().requires_grad_()

@@ -1,5 +1,5 @@
-"""The process window, i.e. random deviations of the print and of the optics from those that the model
-predicts, and the disagreement of several models.
+"""The process window, which describes random deviations of prints from the model's prediction, and of optics
+from the settings. The module also measures the disagreement of several models.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-# The scores of a print are compared with those of the print as modelled. The print passes if each score in dB
-# is lower by at most the first value, if every other score is at least the second value times the modelled
-# score, and if no error exceeds the modelled error divided by the second value.
+# Limits for the scores of a random print, compared with the modelled scores, i.e. the scores of the print
+# that the model predicts. The print passes if each score in dB is lower by at most the first value, if every
+# other score is at least the second value times the modelled score, and if no error exceeds the modelled
+# error divided by the second value.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
 # This is (1e-6 µm)^2. It is far below the variance of any height, and it keeps the square root differentiable
@@ -35,7 +36,7 @@ _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelengt
 
 
 class ProcessWindow(Record):
-    """The spread (standard deviations) of prints and optics, and the way in which a search uses it.
+    """The standard deviations with which prints and optics vary, and the way in which a search uses them.
 
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
@@ -76,16 +77,14 @@ class ProcessWindow(Record):
 
 def _without_idle_defocus(window: ProcessWindow, optics: Optics) -> ProcessWindow:
     """Return the window without a defocus if the light is observed in the far field. There, the image always
-    lies in the focal plane, and another distance would only rescale it.
+    lies in the focal plane, and another focal length would only rescale it.
     """
     far = optics.propagation == "far-field"
     return window.model_copy(update={"defocus_sd_um": 0.0}) if far else window
 
 
 def spreads(window: ProcessWindow, optics: Optics) -> list[str]:
-    """Return a list of texts for reports, each of which states one spread of the window with its value and
-    unit.
-    """
+    """Return a list of texts for reports. Each text states the value and unit of one spread of the window."""
     return [
         f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip()
         for leaf in leaves(_without_idle_defocus(window, optics))
@@ -119,14 +118,14 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     """Return ``count`` draws of the process window with the seed ``window.seed``. A longer list begins with
     the draws of a shorter one.
 
-    With ``unseen``, the draws come from a separate random stream, because a yield must hold for prints that
-    no search has used.
+    If ``unseen`` is True, the draws come from a separate random stream. This is needed for the yield, which
+    must be measured on draws that no search has used.
     """
     window = _without_idle_defocus(window, optics)
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
-    # Each draw uses five random numbers. If another spread is added in future, it needs its own random
-    # stream; otherwise, all existing draws would change.
+    # Each draw uses five random numbers. A sixth number would change all existing draws, so a further spread
+    # would need its own random stream.
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -142,7 +141,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
 
 
 def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Check that the light of every draw, of the search and of the yield, can be propagated.
+    """Check that light can be propagated for all draws, both those of the search and those of the yield.
 
     Raises:
         InputError: the distance in a draw is below the sampling limit of the propagator between ``source``
@@ -178,23 +177,23 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 def allowed_defocus_um(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
-    """Return the largest spread of the defocus, µm, with which the light of every draw can be propagated.
-    This is the spread in ``window``, or a smaller one, rounded down to two digits; it is 0 if the distance
-    itself is too small.
+    """Return the spread of the defocus in ``window``, µm, if light can then be propagated for all draws.
+    Otherwise, return the largest spread for which this is possible, rounded down to two digits. Return 0 if
+    the distance itself is too small.
     """
     drawn = _all_draws(window, optics)
     limit_um = _limit_um(drawn, optics, source, target)
     nearest_um = min(draw.optics.distance_um for draw in drawn)
     if nearest_um >= limit_um:
         return window.defocus_sd_um
-    # The displacement of the image plane in every draw is proportional to the spread.
+    # In every draw, the displacement of the image plane is proportional to the spread of the defocus.
     share = (optics.distance_um - limit_um) / (optics.distance_um - nearest_um)
     return rounded_down(share * window.defocus_sd_um)
 
 
 def rounded_down(value: float) -> float:
-    """Return a value rounded down to two digits, so that advice to stay below it can be followed. A value
-    that is not positive gives 0.
+    """Return a value rounded down to two significant digits, or 0 if it is not positive. A limit that a
+    message advises must not be rounded up, because the rounded limit itself must be allowed.
     """
     if value <= 0:
         return 0.0
@@ -208,7 +207,7 @@ def _all_draws(window: ProcessWindow, optics: Optics) -> list[Draw]:
 
 
 def _limit_um(drawn: Sequence[Draw], optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
-    """Return the smallest distance at which the light of every draw can be propagated, µm.
+    """Return the smallest distance, µm, at which light can be propagated for all draws.
 
     The angular spectrum has no sampling limit, but the distance must be at least the shortest wavelength of
     all draws, so that the image plane lies behind the element.
@@ -220,8 +219,8 @@ def _limit_um(drawn: Sequence[Draw], optics: Optics, source: PixelGrid, target: 
 
 
 class Yield(Record):
-    """The share of random prints that pass, its 95 % confidence interval (by Wilson's method), and the names
-    of the scores that decide whether a print passes.
+    """The share of random prints that pass, the 95 % confidence interval of this share (Wilson's method), and
+    the names of the scores that decide whether a print passes.
     """
 
     draws: int
@@ -238,12 +237,12 @@ def measure_yield(
 ) -> Yield:
     """Measure the share of drawn prints that pass.
 
-    A print passes if its scores are close enough to those of the print as modelled (see ``PASS_DROP_DB`` and
-    ``PASS_SHARE``).
+    A print passes if each of its scores is close enough to the same score of the print that the model
+    predicts (see ``PASS_DROP_DB`` and ``PASS_SHARE``).
 
     Args:
         drawn: scores of each drawn print, keyed by name.
-        modelled: the same scores for the print as modelled.
+        modelled: the same scores for the print that the model predicts, without random changes.
         errors: names of the scores that are better when lower.
     """
     from scipy.stats import binomtest
@@ -272,9 +271,8 @@ def risk(losses: Tensor, tail: float) -> Tensor:
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """Return the disagreement, µm, of several models about a print. At each point, the standard deviation
-    between the heights that the models predict is computed; the result is the rms of this value over the
-    area.
+    """Return the disagreement, µm, of several models about a print. It is the rms, over the area, of the
+    standard deviation between the heights that the models predict at a point.
 
     The result is differentiable. The mean of every print is subtracted first, because a constant height
     causes only a constant phase.
@@ -291,11 +289,12 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """Return a copy of ``window`` with the spreads and the correlation of gain and offset of measured prints.
+    """Return a copy of ``window`` in which the spreads of gain and offset, and the correlation between the
+    two, come from measured prints.
 
     Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound on the
     spread between prints, because it also contains the changing scale of the microscope and the residual of
-    the fit. Locked scans are left out, so that a search never depends on them.
+    the fit. Scans in the lock box are left out, so that a search never depends on them.
 
     Args:
         store: a ``litho_data`` store with at least three scans outside its lock box.

@@ -36,8 +36,8 @@ class Ranks:
 
     @property
     def part(self) -> str:
-        """Return the text that identifies this process in the names of those files that each process writes
-        separately. It is empty if there is only one process.
+        """Return a text for the names of files that each process writes separately. The text identifies the
+        process; it is empty if there is only one process.
         """
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
@@ -47,7 +47,7 @@ class Ranks:
 
     def share(self, count: int, rank: int | None = None) -> range:
         """Divide ``count`` items among the processes, and return the range of the items of the process
-        ``rank``. If no rank is given, this process is meant.
+        ``rank``. By default, ``rank`` is the rank of this process.
         """
         place = self.rank if rank is None else rank
         return range(count * place // self.count, count * (place + 1) // self.count)

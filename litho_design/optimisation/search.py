@@ -1,5 +1,5 @@
-"""The search loop of every task. It optimises free parameters, keeps the best printable levels, and resumes
-from checkpoints.
+"""The search loop of every task. It optimises free parameters, keeps the best or the last printable layout,
+and resumes from checkpoints.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ def search_layout(
     what: str = "designing",
     part: str = "",
 ) -> SearchState:
-    """Minimise ``objective`` over layouts. Only printable layouts, in which each cell has its most probable
-    level (argmax), are compared and kept.
+    """Minimise ``objective`` over layouts. The layout that is kept is always printable: each cell has its
+    most probable level (argmax). The setting ``keep`` says whether the best or the last evaluated layout is
+    kept.
 
     Args:
         parameters: free parameters with their starting values; they are changed in place.
@@ -46,7 +47,7 @@ def search_layout(
         folder: folder in which the checkpoint is written, or None to run without a checkpoint.
         fingerprint: text that identifies the task. A search does not resume from a checkpoint of another
             task.
-        what: word for the work in the progress display.
+        what: word that the progress display shows for the work.
         part: text that names this process if several processes share the search. The name of the checkpoint
             contains this text.
 
@@ -128,7 +129,8 @@ def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) ->
     """
     factor, iterations = settings.rate_factor, settings.rate_iterations
     if settings.rate_schedule == "plateau":
-        # PyTorch's default, a threshold relative to the loss, does not work for a negative loss.
+        # By default, the threshold of PyTorch is relative to the loss, which does not work if the loss is
+        # negative.
         return ReduceLROnPlateau(
             optimiser, factor=factor, patience=iterations, threshold=PROGRESS, threshold_mode="abs"
         )

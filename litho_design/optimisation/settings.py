@@ -76,8 +76,8 @@ class SearchSettings(Record):
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
 
-# The settings of the search that the paper uses for both holograms and lenses. The learning rate is missing,
-# because it differs between the two.
+# Settings of the search in the paper, for holograms and lenses. The learning rate is missing, because it
+# differs between holograms and lenses.
 PAPER_SEARCH = SearchSettings(
     parametrisation="gumbel",
     start="random",
@@ -92,8 +92,8 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """The penalty on the disagreement of several models.
 
-    The loss of a search is the largest of the losses that the models predict, plus ``weight`` times the
-    disagreement of the models, expressed in waves.
+    A search minimises the largest loss that any model predicts, plus ``weight`` times the disagreement of the
+    models in waves.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
@@ -107,8 +107,8 @@ class EnsemblePenalty(Record):
 
 
 class Fabrication(Record):
-    """A penalty on layouts that are unlike the model's training layouts. ``inside_weight`` times the result
-    of the function ``outside`` is added to the loss.
+    """A penalty on layouts that are unlike the model's training layouts. The function ``outside`` computes
+    this penalty, and the search adds ``inside_weight`` times its result to the loss.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
