@@ -1,4 +1,4 @@
-"""Measurements of a printed element: a height map of the element, or a photograph of its light."""
+"""Measurements of a printed element: a height map of the element, or a photograph of the light behind it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class MeasuredSource:
     """A height map of the printed part. If the file does not state the unit and the size, pass ``unit`` and
     ``size_um`` (the side of a square map, or the lengths along y and x).
 
-    Use ``aligned`` for elements that look the same at several positions or in several orientations, such as a
-    lens cap or a blaze.
+    If an element looks the same at several positions or in several orientations, such as a lens cap or a
+    blaze, its scan cannot be registered. In this case, align the scan with the element and set ``aligned``.
     """
 
     path: Path = setting(..., "AFM height map of the printed part", option="--scan")
@@ -54,8 +54,8 @@ class MeasuredSource:
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph of a hologram's image, or of an object through a lens. The counts of the photograph
-    increase with the light.
+    """A photograph of a hologram's image, or of an object through a lens. Above the dark level, the counts
+    must be proportional to the light.
     """
 
     path: Path = setting(

@@ -1,6 +1,4 @@
-"""Estimate the white noise of a measured map, and how the uncertainty of a measurement propagates to its
-scores.
-"""
+"""Estimate the white noise of a measured map, and the uncertainties of the scores of a measurement."""
 
 from __future__ import annotations
 
@@ -15,15 +13,15 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of random draws of the noise. From this many draws, the rms change of a score is known to 25 %.
+# Number of random draws of the noise. With this number of draws, the rms change of a score is known to 25 %.
 DRAWS = 8
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
 
 def white_noise(values: np.ndarray) -> float:
-    """Return the standard deviation of the white noise in a map of shape (ny, nx), from its highest
-    frequencies.
+    """Return the standard deviation of the white noise in a map of shape (ny, nx), from the highest spatial
+    frequencies of the map.
     """
     window, high = _window_and_band(values.shape)
     power = np.abs(np.fft.fft2(values * window)) ** 2 / np.square(window).sum()
@@ -35,10 +33,8 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
     is the standard deviation of the noise in the dark, in counts. The second is the standard deviation of the
     noise that is proportional to the light, as a share of the light.
 
-    The second kind includes speckle.
-
-    The variance at the highest frequencies is fitted by dark^2 + (share * light)^2, where ``dark`` and
-    ``share`` are the two standard deviations.
+    The second kind includes speckle. With the two standard deviations ``dark`` and ``share``, the variance at
+    the highest frequencies is fitted as dark^2 + (share * light)^2.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -67,22 +63,23 @@ def estimated(
     """Correct the scores of a measurement for its errors. Return two dicts, keyed by the name of the score:
     the corrected scores, and their standard deviations.
 
-    Errors that are left in a measurement change a score on average. More of the same error changes it by as
-    much again, so this mean change is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993,
-    chapter 10). A fit hides errors: it makes a print look more like the expected one than it is. The mean
-    change that undoing the fit causes is therefore added.
+    Errors that remain in a measurement bias its scores. If the same error is added once more, the mean change
+    of a score equals this bias, so it is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993,
+    chapter 10). Other errors are hidden: a fit, such as levelling, makes the print look more like the
+    expected print than it is. The mean change of a score over the variants in ``hidden`` is therefore added.
 
-    Variants come in pairs, with an error and the same error of opposite sign. In ``left`` and ``hidden``,
-    each pair changes one independent parameter by its standard deviation. Mean and variance are then exact
-    for a score that is a sum of quadratic functions of normally distributed parameters (JCGM 100:2008,
-    5.1.2).
+    The variants come in pairs. The two variants of a pair contain the same error with opposite signs. In
+    ``left`` and ``hidden``, each pair changes one independent parameter by its standard deviation. If the
+    parameters are normally distributed and the score is a sum of quadratic functions of single parameters,
+    the mean and the variance are exact (JCGM 100:2008, 5.1.2).
 
     Args:
         score: function that scores a variant.
         measured: scores of the measurement.
-        noisier: pairs of variants to which random noise as strong as that of the measurement is added.
-        left: pairs of variants for errors that are left in the measurement.
-        hidden: pairs of variants that a fit cannot distinguish from the measurement.
+        noisier: pairs of variants with added random noise, which is as strong as the noise of the
+            measurement.
+        left: pairs of variants with added errors of the kinds that remain in the measurement.
+        hidden: pairs of variants that the fit cannot distinguish from the measurement.
     """
     noise, rest, fitted = (_changes(score, measured, variants) for variants in (noisier, left, hidden))
     figures, spread = {}, {}
@@ -95,13 +92,15 @@ def estimated(
 
 
 def _changes(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, np.ndarray]:
-    """Return the changes of every score in ``measured`` over the variants, keyed by the name of the score."""
+    """Return, for every score in ``measured``, the differences between the scores of the variants and this
+    score. The dict is keyed by the name of the score.
+    """
     scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
     values = measured.model_dump(exclude_none=True)
     return {name: np.array([one[name] - value for one in scores]) for name, value in values.items()}
 
 
 def _parts(changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split the changes over pairs of variants into their even and their odd parts."""
+    """Split the changes of a score in pairs of variants into their even and their odd parts."""
     plus, minus = changes.reshape(-1, 2).T
     return (plus + minus) / 2, (plus - minus) / 2

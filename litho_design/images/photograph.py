@@ -21,28 +21,30 @@ from litho_design.images.noise import DRAWS, noise_of_light
 from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
-# Above this number of periods of the finest fringes per camera pixel, real spots are as narrow as hot pixels.
+# If a camera pixel contains more than this number of periods of the finest fringes, real spots are as narrow
+# as hot pixels.
 _COARSE = 0.25
 _SMALLEST_CORRELATION = 0.45
 # Largest allowed share of pixels clipped at the bright or dark end. A larger share would change the
 # similarity.
 _LARGEST_SATURATED = 0.01
-# Limits of the deviation of log(gamma) from 0, where gamma is the exponent with which the counts grow with
-# the light. Above the first limit, a photograph is rejected; above the second, a remark is made. Even for
-# prints close to the expected one, the fitted gamma lies between 0.9 and 1.1, not exactly at 1.
+# Limits of |log(gamma)|, where the counts are proportional to light^gamma. Above the first limit, a
+# photograph is rejected; above the second, a remark is made. Even for prints close to the expected one, the
+# fitted gamma lies between 0.9 and 1.1, not exactly at 1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
-# Standard deviation of the loss of light in the corners, which depends on the objective.
+# Standard deviation of the relative loss of light in the corners of a photograph, which depends on the
+# objective.
 _VIGNETTING_SD = 0.1
-# A tilt is accepted if it reduces the unexplained variance to less than this share of the variance without a
-# tilt.
+# A fitted tilt is accepted if the unexplained variance is less than this share of the unexplained variance
+# without a tilt.
 _NEEDED = 0.93
 # A fitted tilt counts as real if its chi squared exceeds this limit. Random errors exceed 13.8 with a
 # probability of 0.1 % (two degrees of freedom).
 _TILT_SURE = 13.8
-# Different models of the same printer predict prints whose images differ in size by this relative standard
-# deviation (rms over three holograms and five models). A photograph cannot determine its scale more
-# accurately than this.
+# Relative standard deviation of the image size between the prints that different models of the same printer
+# predict (rms over three holograms and five models). A photograph cannot determine its scale more accurately
+# than this.
 _PRINT_SCALE_SD = 0.015
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
@@ -61,15 +63,16 @@ class CameraRecord(Record):
     """Source and processing of a photograph. If the photograph was taken through a lens, ``imaged`` is the
     photographed object.
 
-    ``orientation`` is the operation that brings the photograph into the orientation of the image;
-    ``ambiguous`` lists other operations that fit equally well. ``photo_to_window`` is a 3 x 3 matrix that
-    acts on ``(x, y, 1)`` and maps pixels of the file to pixels of the expected image. ``noise_counts`` is the
-    standard deviation of the noise in the dark, and ``noise_share`` is the standard deviation of the
-    additional noise, as a share of the light. ``position_sd_um`` is the standard deviation of the fitted
-    position along one axis, and ``scale_sd`` is the relative standard deviation of the fitted scale.
-    ``vignetting_sd`` is the standard deviation of the possible loss of light in the corners of the
-    photograph. ``blur_um`` is the standard deviation (radius) of the fitted blur that is added to the
-    expected image. The counts are proportional to a power of the light, and ``gamma`` is the fitted exponent.
+    ``orientation`` is the operation that brings the photograph into the orientation of the expected image.
+    ``ambiguous`` lists other operations with which the photograph fits equally well. ``photo_to_window`` is a
+    3 x 3 matrix that acts on ``(x, y, 1)`` and maps pixels of the file to pixels of the expected image.
+    ``noise_counts`` is the standard deviation of the noise in the dark, and ``noise_share`` is the standard
+    deviation of the noise that is proportional to the light, as a share of the light. ``position_sd_um`` is
+    the standard deviation of the fitted position along one axis, and ``scale_sd`` is the relative standard
+    deviation of the fitted scale. ``vignetting_sd`` is the standard deviation of the relative loss of light
+    in the corners of the photograph. ``blur_um`` is the standard deviation (radius) of the fitted blur that
+    is added to the expected image. The counts are fitted as proportional to light^gamma, and ``gamma`` is the
+    fitted exponent.
     """
 
     name: str
@@ -138,12 +141,14 @@ class Photograph:
         averaged_um: side, µm, of the pixels over which ``image`` averages the light (see
             ``photographed_image``).
         record: source and processing of the photograph.
-        expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
-        other_warps: for each independent fitted movement of the camera, the two maps after a movement by plus
-            and minus its standard deviation.
-        other_tilts: such pairs of maps for two independent tilts that were too small to be fitted; empty if a
-            tilt was fitted. A small tilt may come from the camera or from the print, so half of its variance
-            is counted in ``with_other_faults`` and half in ``with_other_fits``.
+        expected: expected counts, shape (m, m). They are used for window pixels that lie outside the
+            photograph.
+        other_warps: pairs of maps like ``window_to_photo``, one pair for each independent movement of the
+            camera in the fit. In the two maps, the camera is moved by plus and minus the standard deviation
+            of this movement.
+        other_tilts: two such pairs of maps, for two independent tilts of the camera; empty if a tilt was
+            fitted. A tilt that is too small to be fitted may come from the camera or from the print. Half of
+            its variance is therefore counted in ``with_other_faults`` and half in ``with_other_fits``.
     """
 
     counts: np.ndarray
@@ -213,12 +218,13 @@ class Photograph:
         flat = counts / (1 - vignetting * _radius_squared(counts.shape))
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
-        # With this map, a window pixel collects the light of more or fewer camera pixels than with the fitted
-        # map.
+        # With the map ``warp``, a window pixel collects the light of more or fewer camera pixels than with
+        # the fitted map.
         found = found * (self._camera_pixels(warp) / self._camera_pixels(self.window_to_photo))
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
-        # Detail finer than the light from the element can form is noise. The remaining detail is corrected,
-        # because a camera pixel averages over another area than a pixel of the expected image.
+        # Detail that is finer than the light from the element can form is noise, and it is removed. The
+        # contrast of the remaining detail is corrected, because the camera pixels and the pixels of the
+        # expected image average over different areas.
         frequency = np.arange(side) / (2 * side * self.pitch_um)
         camera = np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
         sharp = (frequency <= self.finest_per_um) * np.sinc(frequency * self.averaged_um) / camera
@@ -236,10 +242,10 @@ def photographed_image(
     """Register a photograph to the expected image, which was predicted for the design.
 
     The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
-    neighbours. Then a model of the camera is fitted to the expected image by least squares. The position,
-    rotation, gain and background of the model camera are fitted, and its tilt is fitted if needed. The scale
-    is fitted only if the pitch has an uncertainty. If the scale were always fitted, a print that makes the
-    image too large would be mistaken for a camera with a different scale. All eight orientations are tried. A
+    neighbours. Then a model of the camera is fitted by least squares, so that the photograph matches the
+    expected image. Its parameters are position, rotation, gain and background, and a tilt if needed. The
+    scale is fitted only if the pitch has an uncertainty. Otherwise, an image that is too large because of the
+    print would be mistaken for a camera with a different scale. All eight orientations are tried. A
     photograph that fits another orientation better than ``orientation`` is rejected.
 
     Args:
@@ -247,14 +253,14 @@ def photographed_image(
         wanted_pitch_um: side of the pixels of ``wanted``, µm.
         source: greyscale image of any bit depth whose counts are proportional to the light. If the dark level
             is unknown, it is chosen so that the darkest pixels have the expected brightness.
-        finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
+        finest_per_um: highest spatial frequency of the image, 2 NA / wavelength; finer detail is removed.
         averaged_um: side, µm, of the pixels over which the expected image is averaged; the photograph is
             averaged over the same area. Give 0 if the expected image contains values at points.
 
     Raises:
-        InputError: the file is not an image, the pitch is not positive or too coarse for the light, or the
-            orientation is unknown. The error is also raised if the photograph is overexposed, not linear,
-            unlike the expected image, mirrored or rotated.
+        InputError: the file is not an image, the pitch is not positive or too coarse for the finest detail of
+            the image, or the orientation is unknown. The error is also raised if the photograph is
+            overexposed, not linear, unlike the expected image, mirrored or rotated.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
@@ -342,13 +348,15 @@ def photographed_image(
 
 
 def _saturated(raw: np.ndarray) -> float:
-    """Return the share of saturated pixels. A pixel is saturated at the end of the range of 8, 10, 12, 14 or
-    16 bits, or at another maximum at which counts pile up.
+    """Return the share of saturated pixels. A pixel is saturated if it has the highest count of the
+    photograph, and if this count is the end of the range of 8, 10, 12, 14 or 16 bits or occurs in unusually
+    many pixels.
     """
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
     at_top = float((raw == top).mean())
-    # If many pixels have the maximum and few others come close to it, the maximum is the end of the range.
+    # If many pixels have the highest count and few others come close to it, it is the end of the camera's
+    # range.
     beside = float(((raw < top) & (raw >= top - max(1, top // 500))).mean())
     return at_top if top in ends or at_top > max(4 * beside, _LARGEST_SATURATED) else 0.0
 
@@ -369,8 +377,8 @@ def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | Non
 
 
 def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float, float]:
-    """Return the dark level at which the darkest pixels have the expected brightness, and its standard
-    deviation. Only pixels that lie on the photograph count.
+    """Return the dark level with which the darkest pixels have the expected brightness, and the standard
+    deviation of the dark level. Window pixels outside the photograph are ignored.
     """
     import cv2
 
@@ -398,7 +406,8 @@ def _check_orientation(
     shrink = max(1, wanted.shape[0] // _SMALL_PX)
     side = wanted.shape[0] // shrink
     small: Any = cv2.resize(wanted, (side, side), interpolation=cv2.INTER_AREA)
-    # The photograph is averaged to the pixels of the expected image, so that its noise does not decide.
+    # The photograph is averaged over pixels as large as those of the reduced expected image, so that its
+    # noise does not decide.
     finer = max(1, round(wanted.shape[0] / side / scale))
     counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
     small_scale = scale * side / wanted.shape[0]
@@ -430,9 +439,10 @@ def _unlike(photo_file: str | Path, correlation: float) -> InputError:
 
 
 def _replace_outliers(photo: np.ndarray, finest_per_px: float) -> tuple[np.ndarray, int]:
-    """Replace outliers by the median of their 3 x 3 neighbourhood. Outliers deviate from this median by much
-    more than most pixels. If the light has detail that is not much wider than a pixel (``finest_per_px``,
-    cycles/px), outliers must also exceed all of their neighbours, or lie below all of them, by as much.
+    """Replace outliers by the median of their 3 x 3 neighbourhood. An outlier deviates from this median by
+    more than a limit, which few pixels reach. If the image may contain detail almost as narrow as a pixel, an
+    outlier must also lie above all of its neighbours, or below all of them, by more than the limit.
+    ``finest_per_px`` is the highest spatial frequency of the image, in cycles/px.
     """
     import cv2
 
@@ -453,8 +463,8 @@ def _replace_outliers(photo: np.ndarray, finest_per_px: float) -> tuple[np.ndarr
 @dataclass(frozen=True)
 class _Fit:
     """A fitted camera: the map from window pixels to photograph pixels (a matrix of shape (3, 3)), the pairs
-    of maps after each independent movement, and the other parameters of the camera with their standard
-    deviations.
+    of maps ``other_warps`` and ``other_tilts`` (see ``Photograph``), and the other parameters of the camera
+    with their standard deviations.
     """
 
     window_to_photo: np.ndarray
@@ -470,8 +480,9 @@ class _Fit:
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
-    """Fit the camera whose photograph of the expected image is closest to ``photo``. With ``further``, also
-    fit its tilt and the relation between counts and light, and end the fit only at full accuracy.
+    """Fit a camera, so that its photograph of the expected image is as close as possible to ``photo``. If
+    ``further`` is True, the tilt of the camera and the relation between counts and light are also fitted, and
+    the fit has a higher accuracy.
     """
     import cv2
 
@@ -490,13 +501,13 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
     pose[:2] = _shift_px(fixed, seen(smooth, pose))
     free = [0, 1, 2] + ([3] if pitch_sd else [])
-    # A change of 1 in the angle (sine), the log scale or a tilt moves the edge by half a window.
+    # If the angle, the log scale or a tilt changes by 1, the edge of the window moves by half a window.
     unit = np.array([1, 1, *[2 / side] * 4])
-    # Residuals of neighbouring pixels are not independent, so this number of pixels counts as one independent
-    # pixel.
+    # The images are blurred, so residuals of neighbouring pixels are correlated. This number of pixels counts
+    # as one independent pixel.
     alike = 4 * math.pi * blur_px**2
-    # The fit ends when a step changes the sum of squares by less than this part. For the correlation alone,
-    # 1e-4 is accurate enough.
+    # The fit ends when a step reduces the sum of squares by less than this share. If only the correlation is
+    # needed, 1e-4 is accurate enough.
     close = 1e-8 if further else 1e-4
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
@@ -513,7 +524,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             return np.append(off.ravel() / math.sqrt(alike), prior)
 
         def slopes(step: np.ndarray) -> np.ndarray:
-            # The steps are half a pixel, because cv2 resolves positions only to 1/32 of a pixel.
+            # The derivatives use steps of half a pixel, because cv2 resolves positions only to 1/32 of a
+            # pixel.
             ways = 0.5 * np.eye(len(columns))
             return np.stack([residual(step + way) - residual(step - way) for way in ways], axis=1)
 
@@ -524,8 +536,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         at[columns] += found.x * unit[columns]
         return at, found
 
-    # The fit goes from coarse to fine, because the fine structure of an image has false optima next to the
-    # right one.
+    # The fit starts with blurred images. With the fine structure of the images, it could end in a false
+    # optimum next to the right one.
     for more in (4 * blur_px, 0.0):
         images = smooth, fixed
         if more:
@@ -553,8 +565,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     light = _light(seen(photo, pose), wanted, alike)
 
     def around(columns: list[int], covariance: np.ndarray) -> list[list[np.ndarray]]:
-        """For each independent change of the pose in these columns, return the map after this change and the
-        map after the opposite change.
+        """Return a pair of maps for each independent change of the pose in these columns: the map after this
+        change, and the map after the opposite change.
         """
         variance, ways = np.linalg.eigh(covariance)
         steps = np.zeros((len(columns), len(pose)))
@@ -573,11 +585,10 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
 
 def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
-    """Return the covariance of a least-squares fit whose residuals are correlated between neighbours. The
-    covariance is computed from the scatter between tiles.
-
-    If the print differs from the expected print, its apparent displacement varies from place to place. Each
-    tile therefore counts as one observation (White 1980).
+    """Return the covariance of a least-squares fit in which the residuals of neighbouring pixels are
+    correlated. The covariance is computed from the scatter between tiles of the window, and each tile counts
+    as one observation (White 1980). If the print differs from the expected print, the apparent displacement
+    varies from tile to tile.
     """
     tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
     number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))
@@ -610,8 +621,9 @@ def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, fl
 
 
 def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -> np.ndarray:
-    """Return the map from window pixels to photograph pixels, a matrix of shape (3, 3), for a camera pose.
-    The pose consists of a shift (px), a rotation, the logarithm of the scale and two tilts.
+    """Return the map from window pixels to photograph pixels, a matrix of shape (3, 3), for a camera with the
+    given pose. The pose consists of a shift (two values, px), a rotation, the logarithm of the scale and two
+    tilts.
     """
     turn, size, half = pose[2], math.exp(-pose[3]) / scale, (side - 1) / 2
     centre = (np.array(shape[1::-1]) - 1) / 2
@@ -623,7 +635,7 @@ def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -
 
 
 def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
-    """Return a boolean mask, shape (side, side), of the window pixels that lie on the photograph."""
+    """Return a boolean mask, shape (side, side), which is True at window pixels inside the photograph."""
     import cv2
 
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP

@@ -23,8 +23,8 @@ def si_psnr_db(image: Tensor, target: Tensor) -> float:
 
 
 def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
-    """Return the RMSE between I / I_avg and T, where I_avg = sum(I T) / sum(T) is the mean of I, weighted
-    with the target T.
+    """Return the RMSE between I / I_avg and T, where I is the image and T the target. I_avg = sum(I T) /
+    sum(T) is the mean of I, weighted with T.
     """
     average = (image * target).sum() / target.sum()
     return (image / average - target).square().mean().sqrt()
@@ -33,7 +33,7 @@ def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
 def ssim(image: Tensor, target: Tensor) -> float:
     """Return the structural similarity of two images in [0, 1], the mean of ``ssim_map``.
 
-    Windows that extend beyond the edge do not count.
+    Pixels whose window extends beyond the edge are left out.
     """
     edge = SSIM_WINDOW_PX // 2
     found = ssim_map(image.double().cpu().numpy(), target.double().cpu().numpy())

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
-# Number of rows that are drawn at a time. A large picture that is drawn at once in double precision would
+# Number of rows that are drawn at a time. If a large picture were drawn at once in double precision, it would
 # need more memory than the search for its design.
 _ROWS = 256
 
 
 class TargetRecord(Record):
-    """Source of an image, and how the image was fitted to the square."""
+    """The source of an image, and the steps by which the image was fitted to the square."""
 
     name: str
     sha256: str
@@ -63,17 +63,18 @@ class Target:
 
 
 def load_target(source: str | Path | np.ndarray | Tensor | Target, size_px: int) -> Target:
-    """Load a target image of ``size_px``. The source is the name of a drawing, the path of an image, or an
-    array.
+    """Load a target image with a side of ``size_px`` pixels. The source is the name of a drawing, the path of
+    an image, or an array. A ``Target`` is returned unchanged.
 
     Args:
-        source: text, ring, chart, spots or letters; an image file, which is converted to grey values; or an
-            array or tensor of shape (ny, nx) with values in [0, 1], which are not changed. Images and arrays
-            are fitted to the square.
+        source: the drawing text, ring, chart, spots or letters; an image file; or an array or tensor of shape
+            (ny, nx) with values in [0, 1]. An image is converted to grey values and divided by its brightest
+            value; the values of an array are not rescaled. Images and arrays are placed on a black square and
+            resampled to ``size_px``.
 
     Raises:
-        InputError: the source is neither a drawing nor a readable image nor an array of numbers, or the image
-            has no light.
+        InputError: the source is not a drawing, a readable image or an array of numbers, or the image has no
+            light.
     """
     if isinstance(source, Target):
         return source
@@ -110,9 +111,9 @@ def stroke_width_px(pixels: np.ndarray) -> float:
     """
     import cv2
 
-    # The target is enlarged to twice its size, so that strokes whose width is an even number of pixels also
-    # have a pixel on their centre line. The distance of this pixel to the dark is the width of the original
-    # stroke.
+    # Strokes whose width is an even number of pixels have no pixel on their centre line, so the target is
+    # enlarged to twice its size. Then the distance from the centre line to the nearest dark pixel equals the
+    # width of the original stroke.
     bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
     distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
     middle = (distance > 0) & (distance >= cv2.dilate(distance, np.ones((3, 3))))
@@ -120,8 +121,8 @@ def stroke_width_px(pixels: np.ndarray) -> float:
 
 
 def draw_target(name: str, size_px: int) -> np.ndarray:
-    """Draw a target with anti-aliased edges, as a float32 array of shape (size, size), values in
-    [0, 1].
+    """Draw a target with anti-aliased edges. The result is a float32 array of shape (size, size) with values
+    in [0, 1].
     """
     fine = size_px * _OVERSAMPLE
     draw = {"text": _text, "ring": _ring, "chart": _chart, "spots": _spots, "letters": _letters}[name]
