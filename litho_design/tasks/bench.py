@@ -1,5 +1,5 @@
-"""Propagate light through a printed element onto a window in the image plane that has the size of the
-element. This can be done for one or for several sets of optics.
+"""Propagate light through a printed element onto a window in the image plane, for one or for several sets of
+optics. The window has the size of the element.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ElementBench(nn.Module):
-    """Propagate the light of a source through a printed element onto a window in the image plane that has the
-    size of the element.
+    """Propagate the light of a source through a printed element onto a window in the image plane. The window
+    has the size of the element.
 
     ``propagator`` is the propagator for the middle wavelength of the source.
     """
@@ -41,14 +41,14 @@ class ElementBench(nn.Module):
         return self.carried[_key(self.optics.wavelength_um)]
 
     def illumination(self) -> Tensor:
-        """Return the wave behind a flat element, for the middle wavelength and direction of the source, as
-        complex128 of shape (size, size).
+        """Return the wave behind a flat element, complex128 of shape (size, size). The light has the middle
+        wavelength and the middle direction of the source.
         """
         return flat_field(self.grid, self.optics)
 
     def waves(self, height_um: Tensor) -> Iterator[tuple[float, Tensor]]:
-        """Yield one pair for each plane wave of the source: its share of the light, and the wave in the image
-        plane, an array of shape (..., size, size).
+        """Yield one pair for each plane wave of the source: the share of the light in this wave, and the
+        field that it produces in the image plane, shape (..., size, size).
         """
         for share, part in self.parts:
             wave = element_field(height_um, self.grid, part)

@@ -25,9 +25,9 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
 
-# Two values for the estimate of the run time: the number of layouts whose prints every model predicts after
-# the search (the layout found by the search and an uncorrected one), and the time in seconds that writing a
-# report takes.
+# Two values for the estimate of the run time. The first is the number of layouts whose prints every model
+# predicts after the search: the layout found by the search and an uncorrected layout. The second is the time,
+# in seconds, in which a report is written.
 _CANDIDATES, _PAGE_S = 2, 7.0
 # A function that writes the report into the folder of a design. It takes the folder, the record, the task and
 # the history of the search.
@@ -37,18 +37,19 @@ Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
 def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = True) -> Design:
     """Optimise, polish and score the layout of one task, and write the result into the folder ``out``.
 
-    If the folder holds an interrupted run of the same task, the run resumes, and its result equals that of an
-    uninterrupted run. A finished design of the same task is returned. The weights of every model that the
-    search uses are hashed before and after the run. If they changed, no design is written.
+    If the folder holds an interrupted run of the same task, the run resumes, and the result is the same as
+    without the interruption. If the folder holds a finished design of the same task, this design is returned.
+    The weights of every model that the search uses are hashed before and after the run. If they changed, no
+    design is written.
 
     Args:
-        report: function that writes the report. It is called when the arrays are in the folder, before the
-            record is written.
+        report: function that writes the report. It is called after the arrays are saved and before the record
+            is written.
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result, a printer of the search provides no gradients
-            (such a printer can only judge), or the weights of a model changed during the run.
+        InputError: ``out`` holds another design or result, a printer is a virtual fab, which provides no
+            gradients and can only judge, or the weights of a model changed during the run.
     """
     settings, folder = task.settings, Path(out)
     for printer in task.printers:
@@ -134,16 +135,15 @@ def _make(
 
 @torch.no_grad()
 def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
-    """Choose, from the searched and the uncorrected layouts, the one with the smallest loss over all
-    available models.
+    """Return the layout with the smallest loss according to all available models (``Task.over_models``). The
+    candidates are the layout found by the search and the uncorrected layouts.
 
     Args:
         searched: levels that the search found, on the pixels of the layout, shape (size, size).
 
     Returns:
         The levels of the chosen layout, and the width of the design. The width states how much the
-        predictions of the models differ. It is None if there is only one model and only one layout to choose
-        from.
+        predictions of the models differ. It is None if there is only one model and only one candidate.
     """
     candidates = {SEARCHED: searched, **task.untouched()}
     models = _by_name((*task.printers, *task.judges))
@@ -175,8 +175,8 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
 
 
 def _by_name(printers: Sequence[Printer]) -> dict[str, Printer]:
-    """Return the models by name. If an earlier model has the name of a later one but other weights, the
-    source of the later model is added to its name.
+    """Return the models by name. If two models with different weights have the same name, the source of the
+    second model is added to the name of the second model.
     """
     named: dict[str, Printer] = {}
     for one in printers:
@@ -229,10 +229,9 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Estimate the time, in seconds, that the run takes after the search. In this time, the layout is chosen,
-    and the scores and the yield are computed.
-
-    For this estimate, one print prediction by each model and one draw of the process window are timed.
+    """Estimate how long, in seconds, the run takes after the search, when the layout is chosen, and the
+    scores and the yield are computed. For this estimate, each model predicts one print, one draw of the
+    process window is computed, and both are timed.
     """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()

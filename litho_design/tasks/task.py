@@ -69,7 +69,7 @@ class Task:
 
     Args:
         settings: geometry, optics, search and process window.
-        printer: printer of a frozen model or of nominal heights.
+        printer: printer that predicts prints with a frozen model, or that prints nominal heights.
         inputs: mapping from names to the arrays that the task needs, such as targets. Each array is saved as
             NAME.npy with the design.
         ensemble: further models of the printer. By default, the loss is then the worst loss over all models
@@ -77,8 +77,8 @@ class Task:
         record: record that states where the target comes from.
 
     Raises:
-        InputError: the task does not support the start in the settings, or the spreads of the process window
-            lead outside the range in which the propagator is valid.
+        InputError: the task does not support the start in the settings, or the propagator is not valid for
+            some draw of the process window.
     """
 
     name: ClassVar[str]
@@ -109,8 +109,8 @@ class Task:
         self.inputs = dict(inputs or {})
         self.target_record = record
         self.notes: list[str] = []
-        # Further models of the printer that predict the print of the finished design but are not used by the
-        # search.
+        # Further models of the printer. They predict the print of the finished design, but the search does
+        # not use them.
         self.judges: Sequence[Printer] = ()
         for one in self.printers:
             self.check_printer(one)
@@ -122,9 +122,8 @@ class Task:
     # Methods that a user-defined task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
-        """Return one set of optics for each image that the task needs.
-
-        They may differ in wavelength (``optics.at_wavelength``), image plane or angle of incidence.
+        """Return one set of optics for each image that the task needs. The sets may differ in wavelength (see
+        ``optics.at_wavelength``), image plane or angle of incidence.
         """
         return [optics]
 
@@ -146,7 +145,7 @@ class Task:
     # Methods that holograms and lenses override.
 
     def make_cells(self) -> CellMap:
-        """Return the map that spreads one value per cell over the pixels on which the search works."""
+        """Return the map that spreads one value per cell over the pixels that the search uses."""
         return CellMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
@@ -164,10 +163,9 @@ class Task:
         raise NotImplementedError
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return a dict from names to uncorrected layouts of shape (size, size).
-
-        By default, the only such layout is the one from which the search would start for a printer that
-        prints nominal heights.
+        """Return a dict from names to uncorrected layouts of shape (size, size). By default, there is one
+        such layout: the start of a search for a printer that prints nominal heights. If the only start is
+        random, there is none.
         """
         if set(self.starts) == {"random"}:
             return {}
@@ -177,7 +175,7 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses that several models predict into one loss. ``losses`` has shape (models,). By
+        """Combine the losses according to several models into one loss. ``losses`` has shape (models,). By
         default, return the maximum.
         """
         return losses.max()
@@ -186,7 +184,7 @@ class Task:
         """Raise InputError if a printer cannot print the layouts of this task."""
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the bench of the search, which turns the heights from ``search_print`` into the input of
+        """Return the bench that the search uses. It turns the heights from ``search_print`` into the input of
         ``loss``.
         """
         return self.make_bench(optics)
@@ -221,7 +219,7 @@ class Task:
     def thick_score(self, height_um: Tensor) -> Record | None:
         """Score a print that is treated as a thick element.
 
-        Return None if the settings already specify a thick element, or if the task has no light.
+        Return None if the settings already specify a thick element, or if the task does not compute light.
         """
         if self.settings.optics.element == "thick":
             return None
@@ -264,9 +262,9 @@ class Task:
         return made | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Return the efficiency of an ideal element, or None if the task has no such efficiency.
-
-        The search for the ideal element starts from the print, given as heights in µm of shape (size, size).
+        """Return the efficiency of an ideal element, or None if the task defines no ideal element. The ideal
+        element is searched for, starting from the print, which is given as heights in µm of shape (size,
+        size).
         """
         return None
 
@@ -296,8 +294,8 @@ class Task:
     def scenes(self) -> list[tuple[Draw | None, Any]]:
         """Return one pair for each draw of the process window that enters the loss: the draw and its bench.
 
-        If the loss uses no draws, the list has one pair, which contains None instead of a draw and stands for
-        the print as modelled.
+        If the loss uses no draws, the list contains one pair. It has None instead of a draw, and its bench is
+        used with the print that the model predicts.
         """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
@@ -378,10 +376,9 @@ class Task:
         return digest.hexdigest()
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of ``seen``, which is the light behind the print that ``printer`` predicts, and a
-        dict of the named parts of this loss.
-
-        By default, the result of ``loss`` is returned and does not depend on ``printer``.
+        """Return the loss of ``seen`` and a dict of the named parts of this loss. ``seen`` is the light
+        behind the print that ``printer`` predicts. By default, the loss is the result of ``loss`` and does
+        not depend on ``printer``.
         """
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})

@@ -1,5 +1,5 @@
-"""The width of a design, i.e. how far the scores that different models predict for its layout lie apart.
-Uncorrected layouts are scored for comparison.
+"""The width of a design, i.e. how much different models disagree about the score of its layout. Uncorrected
+layouts are scored for comparison.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Width(Record):
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
         figure: name of the main score, which is the first headline score of the task.
         less: True if the main score is better when lower.
-        loss_unit: factor that converts the loss to the unit of the main score. It is set only if the loss
-            already contains the expected error of the model's prediction; otherwise, it is None.
+        loss_unit: factor that converts the loss to the unit of the main score. It is None unless the loss
+            already contains the expected error of the model's prediction.
         level_heights_um: for each model, the printed height of a wide uniform field of each level.
     """
 
@@ -38,8 +38,8 @@ class Width(Record):
     level_heights_um: dict[str, list[float]]
 
     def values(self, candidate: str | None = None) -> np.ndarray:
-        """Return the main score of a candidate according to every model. If no candidate is named,
-        ``returned`` is used.
+        """Return the main score of a candidate according to every model. By default, the candidate is
+        ``returned``.
         """
         by_model = self.figures[candidate or self.returned].values()
         return np.array([figures[self.figure] for figures in by_model])
@@ -47,8 +47,8 @@ class Width(Record):
     @property
     def between(self) -> tuple[float, float]:
         """Return the range in which the main score of a real print is expected. This range covers the values
-        that all models predict. If the expected error e of each model is known, each value v is first
-        replaced by the interval from sqrt(v^2 - (2e)^2) to sqrt(v^2 + (2e)^2).
+        v that the models predict. If ``loss_unit`` is set, the expected error e of each model is known. Each
+        value v is then replaced by the interval from sqrt(v^2 - (2e)^2) to sqrt(v^2 + (2e)^2).
         """
         values = self.values()
         if self.loss_unit is None:
@@ -60,9 +60,9 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """Return the gain of the design, i.e. the difference by which its main score is better than that of
-        the best uncorrected layout. The result is the median over the models. Return None if no uncorrected
-        layout was compared.
+        """Return the gain of the design, i.e. how much better its main score is than the main score of the
+        best uncorrected layout. The gain is computed for each model, and the median is returned. Return None
+        if no uncorrected layout was compared.
         """
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
@@ -77,8 +77,8 @@ class Width(Record):
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """Return the level on whose printed height above level 0 the models disagree most, and the lowest and
-        the highest value that they predict for this height, µm.
+        """Return the level whose printed height above level 0 differs most between the models. Also return
+        the lowest and the highest prediction of this height, µm.
         """
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]
