@@ -78,8 +78,8 @@ class LensOptics(nn.Module):
         return 0.0
 
     def thin(self) -> Self:
-        """Return this bench for a thin element, with the same propagator. The slopes of a thick element cast
-        shadows, so only a thin element is a perfect lens.
+        """Return a copy of this bench for a thin element, with the same propagator. Only a thin element can
+        be a perfect lens, because the slopes of a thick element cast shadows.
         """
         bench = copy.copy(self)
         bench.optics = self.optics.model_copy(update={"element": "thin"})
@@ -94,8 +94,8 @@ class LensOptics(nn.Module):
         """Return the heights of a perfect lens, µm, wrapped at the height that gives a phase delay of 2π."""
         focal_um = self.optics.distance_um
         path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt() - self.oblique_path_um()
-        # This height delays the wave by the difference in path length; wrapping the height does not change
-        # the wave.
+        # This height delays the wave by the difference in path length. The wave does not change if the height
+        # is wrapped.
         height = path * self.optics.wave_height_um / self.optics.wavelength_um
         return torch.remainder(height, self.optics.wave_height_um).float()
 
@@ -131,7 +131,7 @@ class LensBench(LensOptics):
 
 
 class RadialLensBench(LensOptics):
-    """Compute the PSF of a ring layout with a circular aperture from the heights along a radius."""
+    """Compute the PSF of a lens of rings behind a circular aperture, from the heights along a radius."""
 
     lower: Tensor
     share: Tensor
@@ -155,8 +155,8 @@ class RadialLensBench(LensOptics):
         """
         phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
-        # The complex wave is interpolated along the radius, and not its intensity, because only the wave is
-        # smooth on the scale of a pixel.
+        # The complex wave is interpolated along the radius, because the intensity is not smooth on the scale
+        # of a pixel.
         here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
         return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
 
@@ -170,20 +170,19 @@ def centre_to_background(psf: Tensor, centre_px: float, element_px: int) -> Tens
     """Return the mean intensity in the central box of a PSF, divided by the mean intensity on the background,
     i.e. on the rest of an image plane that is as large as the element.
 
-    All light outside the box counts as background, even if it misses this image plane. For the mean
-    background, the share of this light (1 minus the share in the box) is therefore divided by the area of the
-    element outside the box. A ratio computed only within the PSF window would reward light sent outside the
-    window.
+    All light outside the box counts as background, even if it misses this image plane. The mean background is
+    therefore (1 - share in the box) / (area of the element - area of the box). If only the PSF window were
+    counted, layouts that send light outside the window would have better ratios.
 
-    The box is centred on the window, and need not be a whole number of pixels wide. A pixel on its edge
-    counts by the share of its area that lies inside.
+    The box is centred on the window. Its width need not be a whole number of pixels; a pixel on the edge of
+    the box is weighted with the share of its area inside the box.
     """
     side, half_px = psf.shape[-1], centre_px / 2
     left = torch.arange(side, dtype=torch.float64, device=psf.device) - side / 2
     inside = ((left + 1).clamp(max=half_px) - left.clamp(min=-half_px)).clamp(min=0).to(psf)
     first, last = max(math.floor(side / 2 - half_px), 0), min(math.ceil(side / 2 + half_px), side)
-    # The box is cropped after the multiplication, so that a box of whole pixels is summed in the order of the
-    # PSF's rows.
+    # The box is cropped after the multiplication. If the box consists of whole pixels, its sum then has the
+    # same order as a sum over the PSF's rows.
     box = (psf * inside[:, None] * inside)[..., first:last, first:last].sum()
     rest = (1 - box) / (element_px**2 - centre_px**2)
     return box / centre_px**2 / rest

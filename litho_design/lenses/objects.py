@@ -1,4 +1,4 @@
-"""The objects that a lens images: built-in drawings, or pictures of the user."""
+"""The objects that a lens images: built-in drawings, or pictures that the user provides."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ PICTURES = "object_pictures"
 def object_stack(
     objects: Sequence[ImagedObject], size_px: int, pictures: Iterable[np.ndarray] = ()
 ) -> Tensor:
-    """Return n objects with values in [0, 1], shape (n, size, size). Each of them has a dark border, one
-    eighth of its size wide on every side.
+    """Return n objects with values in [0, 1], shape (n, size, size). Each object has a dark border on every
+    side, whose width is one eighth of the side of the frame.
 
     Args:
         objects: names of drawings, and records of pictures.
         size_px: side of the frame, in sensor pixels.
-        pictures: for each object that is a picture, its pixels as a float32 array of shape (size, size) in
-            [0, 1], in the order of ``objects``.
+        pictures: pixels of those objects that are pictures, in the order of ``objects``. Each is a float32
+            array of shape (size, size) with values in [0, 1].
 
     Raises:
         InputError: the pixels of a picture are missing or do not have the shape (size, size).
@@ -58,10 +58,10 @@ def with_objects(
     """Return the settings of a computational lens that images the given pictures, and the pixels of these
     pictures.
 
-    Each path is that of a picture, or of a folder that contains only pictures and hidden files. If
-    ``held_out`` is empty, the pictures are sorted by name, and the last quarter of them (at least two
-    pictures) is not used in the search and serves only for scores. If ``objects`` is empty, the search uses
-    the built-in drawings.
+    Each path names a picture, or a folder that contains only pictures and hidden files. If ``held_out`` is
+    empty, the pictures are sorted by name. The last quarter of them (at least two pictures) is then held out,
+    i.e. used only for scores and not in the search. If ``objects`` is empty, the search uses the built-in
+    drawings.
 
     Returns:
         The settings and the inputs of the task. The settings contain the name, the SHA-256 and the

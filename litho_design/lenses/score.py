@@ -88,8 +88,8 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
 
 
 def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
-    """Return the full width at half maximum of a PSF, µm. It is the diameter of the circle whose area equals
-    that of the region above half the maximum.
+    """Return the full width at half maximum of a PSF, µm. It is the diameter of a circle with the same area
+    as the region above half the maximum.
 
     The PSF is interpolated to four times as many pixels per side by zero-padding its spectrum, so that the
     size of its pixels does not limit the result.
@@ -98,8 +98,8 @@ def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
     spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
     pad = (fine - 1) * psf.shape[-1] // 2
     image = torch.fft.ifft2(torch.fft.ifftshift(torch.nn.functional.pad(spectrum, (pad,) * 4))).real
-    # A spectrum with an odd side cannot be padded to exactly four times its length, so the sample spacing is
-    # computed from the actual lengths.
+    # A spectrum with an odd number of samples cannot be padded to exactly four times this number, so the
+    # sample spacing is computed from the actual numbers.
     sample_um = pitch_um * psf.shape[-1] / image.shape[-1]
     area = float((image > image.max() / 2).sum()) * sample_um**2
     return 2 * math.sqrt(area / math.pi)
@@ -157,8 +157,8 @@ def black_images(objects: Tensor) -> dict[str, float]:
 
 
 def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
-    """Return the values of each score for all draws of the noise and all objects, keyed by the name of the
-    score.
+    """Return the values of every score, one for each draw of the noise and each object. The dict is keyed by
+    the name of the score.
     """
     rows: dict[str, list[float]] = {}
     for name, images in (one for draw in draws for one in draw.items()):

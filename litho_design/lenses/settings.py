@@ -53,9 +53,9 @@ class ImagingSettings(Record):
 
     An object is given by the name of a drawing or by the record of a picture (see ``with_objects``).
     ``read_noise`` is the standard deviation of the read noise, relative to the brightness of a white object
-    behind a lens that focuses all light. The paper does not state its read noise. The image of an object has
-    a width of ``object_px * pixel_px`` layout pixels. Light outside the PSF window does not contribute to
-    this image.
+    behind a lens that focuses all light. The paper does not state its read noise. The image of an object is
+    ``object_px * pixel_px`` layout pixels wide. The part of the PSF outside the PSF window does not
+    contribute to this image.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
@@ -94,7 +94,8 @@ class ImagingSettings(Record):
 
 
 # The paper images a display that is 36 mm wide at a distance of 140 mm; at 400 µm behind the lens, its image
-# is 102.9 µm wide. 137 sensor pixels are this width plus a dark border of 1/8 on each side.
+# is 102.9 µm wide. Objects with 137 sensor pixels have this width inside a dark border, which is 1/8 of the
+# 137 pixels wide on each side.
 PAPER_IMAGING = ImagingSettings(pixel_px=10, object_px=137)
 
 
@@ -109,8 +110,8 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
-    # The yield is measured with few draws, because for each draw the light on the whole plane is computed.
-    # This takes as long as ten steps of the search along a radius.
+    # The yield is measured with few draws, because each draw takes as long as ten steps of the search along a
+    # radius: it needs the light on the whole plane.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")
@@ -124,16 +125,15 @@ def lens_settings(
     All presets have layouts of rings, a width of 120 µm and a focal length of 400 µm.
 
     ``paper`` has 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at a learning rate of 3,
-    and a square aperture. That the layout consists of rings is taken from the published code, because the
-    text of the paper does not mention it. The display of the paper is 36 mm wide at a distance of 140 mm, so
-    its image on the sensor is 102.9 µm wide: 103 pixels of 1 µm. The PSF window has the same width. We chose
-    pixels of 1 µm, because they sample the cut-off frequency at NA 0.15 (a period of 2.1 µm) without
-    aliasing.
+    and a square aperture. The paper does not mention that the layout consists of rings; this comes from the
+    published code. The display of the paper is 36 mm wide at a distance of 140 mm, so its image on the sensor
+    is 102.9 µm wide, which is 103 pixels of 1 µm. The PSF window has the same width. We chose pixels of 1 µm,
+    because they sample the cut-off frequency at NA 0.15 (a period of 2.1 µm) without aliasing.
 
     ``authors`` has the settings of the published code: 12 levels, rings as wide as the diagonal of a pixel,
     temperature 1 and smooth L1. The 2000 iterations begin with a learning rate of 1, which is halved every 25
-    iterations. The images have read noise and photon noise, and the wavelength and the index step are those
-    of the code. The objects are as wide as the lens. docs/from_the_authors_code.md lists the parts of that
+    iterations. The images have read noise and photon noise. The wavelength and the index step are also taken
+    from the code. The objects are as wide as the lens. docs/from_the_authors_code.md lists the parts of that
     code that are not reproduced.
 
     ``default`` has a circular aperture, starts from the phase of a Fresnel lens, and searches along a radius.

@@ -59,14 +59,14 @@ class LensTask(Task):
 
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
-        printer: printer of a frozen model or of nominal heights.
+        printer: printer that predicts prints with a frozen model, or that prints nominal heights.
         ensemble: further models that contribute to the loss, as for ``Task``.
-        inputs: pixels of those objects that are pictures, as returned by ``with_objects``.
+        inputs: the pixels of the pictures among the objects, as ``with_objects`` returns them.
 
     Raises:
-        InputError: a radial search is combined with a layout without rings or with a square aperture; the
-            start in the settings works only for other tasks; the pixels of an object are missing; or the
-            spreads of the process window exceed the range of the propagator.
+        InputError: ``check_lens`` rejects the settings; this task does not support the start in the settings;
+            the pixels of an object are missing; or the propagator is not valid for some draw of the process
+            window.
     """
 
     starts = ("random", "fresnel")
@@ -110,8 +110,8 @@ class LensTask(Task):
         return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        """Return a bench that computes along a radius, if the layout and the printers allow this. Otherwise,
-        return a bench of the whole plane.
+        """Return a bench that computes along a radius, if the settings request this search and no printer
+        depends on the position. Otherwise, return a bench of the whole plane.
         """
         if not self.radial:
             return self.make_bench(optics)
@@ -136,7 +136,7 @@ class LensTask(Task):
         return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose printed phase comes closest to that of a perfect lens.
+        """Return the levels whose printed phases come closest to the phases of a perfect lens.
 
         The levels are computed on the CPU, so that sums over rings are reproducible.
         """
@@ -170,7 +170,7 @@ class LensTask(Task):
         """Predict the print of a strip along one radius, and return the heights, µm, of the rings inside the
         aperture. The result has shape (rings,).
 
-        Beyond the aperture, the levels of the strip are those that the layout has in its corners.
+        Beyond the aperture, the strip has the same levels as the corners of the layout.
         """
         rings, halo = self.cells.average(level[0, 0]), printer.strip_halo_px
         strip = rings[strip_rings(self.settings.layout, halo, len(rings))][None, None]
@@ -205,9 +205,9 @@ class ComputationalLensTask(LensTask):
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the error of the objects that Richardson-Lucy deconvolution reconstructs from the sensor
-        images. Also return a dict with the centre-to-background ratio and the share of the power in the PSF
-        window.
+        """Return the difference between the objects and their reconstructions from the sensor images by
+        Richardson-Lucy deconvolution, as a mean error. Also return a dict with the centre-to-background ratio
+        and the share of the power in the PSF window.
         """
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
@@ -231,7 +231,7 @@ class ComputationalLensTask(LensTask):
         return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the scores of the baselines that every lens task has, and those of black images."""
+        """Return the scores of the baselines that every lens task has, and the scores of black images."""
         return super().baselines() | {"black image": black_images(self.tested)}
 
 
@@ -265,7 +265,8 @@ def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
 
 
 def check_lens(settings: LensSettings, *, radial: bool) -> None:
-    """Check that the settings describe a lens that can be designed, along a radius if ``radial`` is True.
+    """Check that a lens with these settings can be designed. If ``radial`` is True, it must be possible to
+    design it along a radius.
 
     Raises:
         InputError: a search along a radius cannot represent the layout, the aperture or the light; the
@@ -295,7 +296,8 @@ def check_lens(settings: LensSettings, *, radial: bool) -> None:
 def _check_outermost_zone(settings: LensSettings) -> None:
     """Check that the outermost zone of the lens is at least two cells wide. The width of this zone is the
     wavelength divided by the sum of two sines: the sine of the ray from the farthest point of the rim to the
-    image, and the sine of the oblique light. On one side of the rim, the two add up.
+    image, and the sine of the oblique light. On one side of the rim, the two sines have the same sign, so
+    they are added.
     """
     layout, optics = settings.layout, settings.optics
     radius_um = layout.size_um / 2 * (math.sqrt(2) if settings.view.aperture == "square" else 1)
