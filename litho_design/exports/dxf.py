@@ -1,5 +1,5 @@
-"""Write layouts as DXF (R12, ASCII) with closed polylines. Each level has its own layer, which is named after
-the grey value of the level.
+"""Write layouts as DXF (R12, ASCII) with closed polylines. Each level has its own layer, whose name is the
+grey value of the level.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ _SUFFIX: dict[str, str] = {
 _GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
 # Largest number of pixels of a layout for the formats that are written in one piece, not band by band. With
-# more pixels, writing an image would need more than about 3 GiB of memory, and writing a solid even more.
+# more pixels, more than about 3 GiB of memory would be needed to write an image, and even more to write a
+# solid.
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
@@ -91,10 +92,10 @@ def export(
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; it may already hold exports of the same layout in other formats.
         pitch_um, level_height_um: side of a pixel and height of a level, used only for arrays. Designs and
-            elements state these values themselves.
+            elements contain their own values.
         dose_curve: for the formats with grey values (bmp, png16 and dxf), a CSV file with the columns
-            ``grey,height_um`` that gives the printed height of each grey value. Without it, the grey value is
-            linear in height.
+            ``grey,height_um``, which states the printed heights of grey values. Without a dose curve, the
+            grey value is linear in height.
         marks: add an orientation mark and a flat witness area beside the element (see ``with_marks``).
         job: changes to the default settings of ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode":
             "piezo"}``.
@@ -155,8 +156,8 @@ def export(
         back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], levels[rows]) for rows in bands_of(levels, _BAND_PX)):
             raise AssertionError(f"the {format} file does not contain the layout that was exported")
-        # The sidecar is moved to the folder last. Until then, the exported file has no sidecar or an outdated
-        # one, so ``import_levels`` cannot read an unfinished export by mistake.
+        # The sidecar is moved to the folder last. If the export is interrupted before that, the exported file
+        # has no sidecar or an outdated one, so ``import_levels`` refuses it.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
             part.replace(place / part.name)
     return place / name

@@ -1,5 +1,5 @@
-"""Write layouts as GDSII, one band of rows at a time. The file has one layer per level, and equal blocks of
-pixels share one GDS cell.
+"""Write layouts as GDSII, one band of rows at a time. The file has one layer per level. Blocks of pixels with
+equal levels share one GDS cell.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def write_gds(
     number of rectangles in the file.
 
     Layer k contains the pixels with level >= k (``cumulative``; k starts at 1) or the pixels with level == k
-    (``exclusive``; k starts at 0). Runs of such pixels along a row are merged with equal runs in the rows
-    below, so every shape is a rectangle. The cell LAYOUT references one cell for each part. The cell of a
-    part references one cell for every 128 rows, which in turn references the cells of blocks 128 pixels wide.
-    Equal blocks share a cell. Only the shapes of one block are in memory at a time.
+    (``exclusive``; k starts at 0). A run of such pixels along a row is merged with equal runs in the rows
+    below, so every shape is a rectangle. The GDS cell LAYOUT references one GDS cell for each part. The GDS
+    cell of a part references one for every 128 rows, and each of these references the GDS cells of blocks 128
+    pixels wide. Equal blocks share a GDS cell. Only the shapes of one block are in memory at a time.
 
     Args:
         parts: mapping from the name of each part to its box (first row, end row, first column, end column),
@@ -62,7 +62,8 @@ def write_gds(
                     shapes = _shapes(block, pitch_um, layers)
                     drawn += len(shapes)
                     writer.write(gdstk.Cell(f"BLOCK_{len(known)}").add(*shapes))
-                    # Later blocks refer to the cell by name, so its shapes need not stay in memory.
+                    # Later references to this GDS cell need only its name, so its shapes need not stay in
+                    # memory.
                     known[key] = gdstk.Cell(f"BLOCK_{len(known)}")
                 cell.add(gdstk.Reference(known[key], (column * pitch_um, 0)))
             writer.write(cell)
@@ -99,7 +100,8 @@ def rectangles(masks: np.ndarray) -> np.ndarray:
     edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
     mask, row, left = np.nonzero(edges > 0)
     right = np.nonzero(edges < 0)[2]
-    # Equal runs of one mask are sorted from top to bottom, and a rectangle continues until a row is missing.
+    # Runs of one mask that begin and end in the same columns are sorted from top to bottom. A rectangle ends
+    # where the next row has no such run.
     order = np.lexsort([row, right, left, mask])
     mask, row, left, right = (one[order] for one in (mask, row, left, right))
     new = np.ones(len(row) + 1, bool)

@@ -15,8 +15,8 @@ from litho_design.printers.layout import LayoutSettings
 
 _UM_PER_CM = 1e4
 _STRIP_PX = 64
-# Offsets in a classic TIFF have 32 bits. If the pages need more bytes than this limit, the file is written as
-# a BigTIFF. The limit leaves room for the tags.
+# If the pages need more bytes than this limit, the file is written as a BigTIFF, because offsets in a classic
+# TIFF have 32 bits. The limit leaves room for the tags.
 _CLASSIC_BYTES = 2**32 - 2**24
 
 
@@ -34,8 +34,8 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
 
 
 def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list[int]:
-    """Return, for each level, the grey value whose measured height equals the height of the level, apart from
-    an offset that is the same for all levels.
+    """Return the grey value of each level, such that the measured heights of these grey values equal the
+    heights of the levels, apart from an offset common to all levels.
 
     Args:
         curve: CSV with the columns ``grey`` and ``height_um``, for example from a dose matrix. The values in
@@ -67,7 +67,9 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
 
 
 def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:
-    """Write a 16-bit greyscale PNG, or an 8-bit BMP and a CSV that gives the height of each grey value."""
+    """Write a 16-bit greyscale PNG; or an 8-bit BMP, together with a CSV that states the height of each grey
+    value.
+    """
     import cv2
 
     kind = np.uint8 if path.suffix == ".bmp" else np.uint16

@@ -31,8 +31,8 @@ class Gwl(Record):
 
 
 class PrintJob(Record):
-    """Settings of a print job. The base is printed only from STL and GWL files, but every sidecar records the
-    base, the slicing and the hatching.
+    """Settings of a print job. Only STL and GWL files contain the base, but every sidecar records the base,
+    the slicing and the hatching.
     """
 
     pedestal_um: float = setting(

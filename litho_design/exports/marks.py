@@ -1,5 +1,5 @@
-"""Add two marks beside an element: an F, which shows the orientation of the print, and a flat witness area,
-which shows its height.
+"""Add two marks beside an element: an F, from which the orientation of the print can be seen, and a flat
+witness area, on which its height can be measured.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ Box = tuple[int, int, int, int]
 # An F looks different in all eight orientations.
 _LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 _STROKE_UM = 1.0
-# Width of the middle part of the witness area. It is at least the reach of the printer away from the edges,
-# so the edges do not affect its printed height.
+# Width of the middle part of the witness area. Its distance from the edges is at least the reach of the
+# printer, so the edges do not affect its printed height.
 _FLAT_UM = 4.0
 
 
@@ -27,8 +27,8 @@ class Marks(Record):
     """Positions of the element, the orientation mark and the witness area in an exported map. Each position
     is a box in pixels (first row, end row, first column, end column), where the ends are exclusive.
 
-    ``witness_height_um`` is the height above its surroundings that the model of the design predicts for the
-    middle of the witness area.
+    ``witness_height_um`` is the predicted height of the middle of the witness area above its surroundings. It
+    is predicted by the model that was used for the design.
     """
 
     element_px: Box
@@ -47,8 +47,8 @@ def with_marks(
 ) -> tuple[np.ndarray, Marks]:
     """Add an F and a square of the highest level to the right of a level map of shape (size, size).
 
-    The F, the square and the element are separated by at least the reach of the printer, so none of them
-    changes the print of another. The element, the F and the square consist of whole cells.
+    The F, the square and the element are separated by at least the reach of the printer, so that none of them
+    affects the print of another. The element, the F and the square consist of whole cells.
 
     Args:
         guard_um: reach of the printer, µm, i.e. the distance up to which a level affects the print.

@@ -13,8 +13,8 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map of shape (ny, nx) in memory or on disk, with row 0 at the top. Its rows can be sliced like
-    those of an array.
+    """A level map of shape (ny, nx) in memory or on disk, with row 0 at the top. Its rows can be sliced as in
+    an array.
     """
 
     @property
@@ -30,8 +30,8 @@ class RingRows:
     """The level map of a lens that consists of rings. Only those rows that are requested are computed.
 
     Args:
-        ring_level: level of each pixel along the radius, uint8. In the corners of the map, beyond the
-            aperture, all pixels have the last of these levels.
+        ring_level: level of each pixel along the radius, uint8. The last of these levels is also the level of
+            all pixels in the corners of the map, beyond the aperture.
     """
 
     ring_level: np.ndarray
@@ -51,8 +51,8 @@ class RingRows:
 
 
 def layout_rows(folder: str | Path) -> LevelRows:
-    """Open the levels in a design folder without loading them into memory, and check their file against the
-    hash in the record of the design.
+    """Open the levels in a design folder without loading them into memory, and check the file of the levels
+    against the hash in the record of the design.
 
     Raises:
         InputError: the folder contains no design, or the file of the levels changed after the design was

@@ -1,4 +1,6 @@
-"""The sidecar of an exported file: the heights, sizes and hashes that the file itself cannot hold."""
+"""The sidecar of an exported file. It contains heights, sizes and hashes, which the file itself cannot
+contain.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +102,7 @@ def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
 
 
 def of_design(folder: Path | None, design: Design | None) -> dict[str, Any]:
-    """Return the fields of the sidecar that come from a design, or no fields if there is no design."""
+    """Return the fields of the sidecar that come from a design, or an empty dict if there is no design."""
     if folder is None or design is None:
         return {}
     shared = {name: getattr(design, name) for name in _OF_DESIGN}

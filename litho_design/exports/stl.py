@@ -1,5 +1,5 @@
-"""Write a layout as a closed solid (binary STL, µm). The top of each cell consists of two triangles, and the
-vertical walls between cells meet at the corners of cells.
+"""Write a layout as a closed solid (binary STL, µm). The top of each cell consists of two triangles.
+Neighbouring cells of different levels are joined by a vertical wall.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _BELOW = -1
 def write_stl(
     path: Path, levels: np.ndarray, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> int:
-    """Write the solid whose top lies at the height ``pedestal_um + level * level_height_um``. Return the
-    number of triangles.
+    """Write a solid in which the top of each cell has the height ``pedestal_um + level * level_height_um``.
+    Return the number of triangles.
 
-    Every edge belongs to two faces, even where columns touch only along an edge; see ``step_solid``.
+    Every edge belongs to two triangles, even where columns touch only along an edge (see ``step_solid``).
 
     Args:
         levels: integer level of each cell, shape (ny, nx), with row 0 at the top. In the file, y points
@@ -60,8 +60,8 @@ def write_stl(
 def step_solid(levels: np.ndarray) -> np.ndarray:
     """Return the triangles of the solid that has one column per cell.
 
-    Every edge belongs to two faces, which traverse it in opposite directions. To achieve this, each end of a
-    wall has a vertex at the height of every column top that meets there.
+    Every edge belongs to two triangles, which traverse it in opposite directions. For this purpose, a wall
+    has vertices along its two vertical ends, at the tops of all columns that meet there.
 
     Args:
         levels: non-negative integers, shape (ny, nx); y increases with the row.
@@ -94,8 +94,8 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Return the positions (x, y, z) of n grid points. The result has shape (n, 3).
 
-    ``point`` contains the row and the column of each point, shape (n, 2). Points that are True in ``moved``
-    are shifted slightly in the direction ``way``, towards one of the cells around them.
+    ``point`` contains the row and the column of each point, shape (n, 2). Where ``moved`` is True, the point
+    is shifted slightly in the direction ``way``, towards one of the cells around it.
     """
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)
@@ -105,8 +105,8 @@ def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
     """Return the two triangles of the top of each cell."""
     cell = np.argwhere(around[:-1, :-1, 3] >= 0)
     z = around[cell[:, 0], cell[:, 1], 3]
-    # The loop starts at the cell's south-west point, from which the cell lies north-east, and goes around the
-    # cell.
+    # The loop goes around the cell. It starts at the south-west point of the cell; the cell lies north-east
+    # of this point.
     corners = []
     for step, way in (((0, 0), 3), ((0, 1), 2), ((1, 1), 0), ((1, 0), 1)):
         point = cell + step
@@ -139,7 +139,8 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
     strips += [(west[i], east[3], west[i + 1]) for i in range(3)]
     found = []
     for a, b, c in strips:
-        # Triangles run counter-clockwise as seen from the south; a wall faces its lower cell.
+        # In ``strips``, the corners run counter-clockwise as seen from the south. The outside of a wall is
+        # the side of the lower cell.
         faces = np.where((south > north)[:, None, None], np.stack([c, b, a], 1), np.stack([a, b, c], 1))
         corners_apart = (a != b).any(1) & (b != c).any(1) & (c != a).any(1)
         found.append(faces[corners_apart])
