@@ -1,1 +1,3 @@
-"""Score a finished design as models predict it, as an AFM measures it, or as a camera photographs it."""
+"""Score a finished design by predictions of its print, by an AFM scan of the print, or by a photograph of its
+light.
+"""

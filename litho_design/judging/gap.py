@@ -24,7 +24,7 @@ from litho_design.tasks.design import DESIGNS
 
 class GapEntry(Record):
     """One design (of one arm and one seed), with the scores of the print that one judge predicts.
-    ``designed`` contains the scores of the print that the arm's own model predicts.
+    ``designed`` contains the scores of the print as predicted by the arm's own model.
     """
 
     arm: str
@@ -71,8 +71,8 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # The type with the fewest fields comes first, because the settings of a user-defined task have only the
-    # fields common to all designs.
+    # The type with the fewest fields comes first. It fits the settings of a user-defined task, which have
+    # only the fields common to all designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
@@ -89,7 +89,9 @@ def design_folder(out: Path, arm: str, seed: int) -> Path:
 
 
 def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
-    """Return the mean, the confidence interval and the gap of every score, for every arm and judge."""
+    """Return one summary for every score, arm and judge: the mean with its confidence interval, and the mean
+    gap, i.e. the designed score minus the judged score.
+    """
     summary = []
     for (arm, judge), group in _grouped(entries).items():
         for figure in group[0].judged:
@@ -111,7 +113,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """Return the differences of the given scores between every pair of arms, for each judge."""
+    """Return the differences in the given scores between every two arms, according to each judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))

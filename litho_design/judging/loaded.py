@@ -34,7 +34,8 @@ from litho_design.tasks.task import Task, registered_task
 
 
 class LoadedDesign:
-    """A design read from its folder: the layout, its optics and its scores, for any task.
+    """A design of any task, read from its folder. It contains the layout and the optics, and it computes
+    scores.
 
     Attributes:
         folder: folder of the design.
@@ -50,7 +51,7 @@ class LoadedDesign:
         folder: a design folder; its arrays are checked against the hashes in the record. For a lens of rings,
             levels and heights are given along a radius, not over a plane.
         device: where prints and waves are computed.
-        element: ``thin`` or ``thick``, to override the kind of element that the design states (see
+        element: ``thin`` or ``thick``, to be used instead of the kind of element in the record (see
             ``Optics``).
         band_px: if given, the print of a large hologram is predicted and scored in bands of at most this many
             rows.
@@ -84,8 +85,8 @@ class LoadedDesign:
         self.target: Tensor | None = getattr(self.task, "target", None) if whole else None
 
     def _task(self, band_px: int | None) -> Task:
-        """Return the task of the design. The task is used only to compute scores, so it needs a device but no
-        printer model.
+        """Return the task of the design. It needs a device but no model of the printer, because it is used
+        only to compute scores.
         """
         record, kind = self.record, registered_task(self.record.task)
         nominal = Printer(None, record.layout, source="none").to(self.device)
@@ -129,8 +130,8 @@ class LoadedDesign:
         return self.task.score(known_height(height_um, self.expected_um), self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """Return an image scaled to match its target, for reports. A PSF is divided by its peak, and the
-        square root is shown.
+        """Return a picture of ``image`` for reports. The image of a hologram is scaled to match its target.
+        For a PSF, the picture is sqrt(PSF / peak).
         """
         return self.task.display(image)
 

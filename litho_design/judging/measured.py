@@ -21,26 +21,26 @@ from litho_design.images.measurements import Levelling, MeasuredSource
 from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
 
-# Smallest share of the element that must be measured. With fewer measured pixels, the score would mainly
-# describe the filled-in part, not the print.
+# Smallest share of the element that must be measured. With fewer measured pixels, the score would depend too
+# much on the filled-in part.
 _SMALLEST_COVERAGE = 0.8
 # Smallest correlation between a scan and the expected print at which the scan is accepted. After levelling,
 # the prints of the measured layouts have a correlation of 0.9 or more with the print that a model predicts.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
-# Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
-# step.
+# Deviations count as dust only if they are larger than the random errors of a print, and wider than the
+# deviations at a displaced step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# A deviation counts as dust if fewer than this share of the other pixels with the same expected height
-# deviate as well. Heights that differ by less than ``_LIKE_HEIGHT_UM`` count as the same.
+# A deviation counts as dust if the share of deviating pixels among all others with the same expected height
+# is smaller than this value. Heights that differ by less than ``_LIKE_HEIGHT_UM`` count as the same.
 _LARGEST_DUSTY_SHARE, _LIKE_HEIGHT_UM = 0.3, 0.005
 # Standard deviation of the height correction for the AFM tip, as a share of this correction.
 _TIP_SD = 0.3
 # Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
-# In tilt and bow, a print deviates from the expected print more than in the orders above, by the factor
-# ``_LARGER``. In addition, all tilt and bow of a print may be wrong by one common relative error, whose
+# The deviation of a print from the expected print is larger in tilt and bow than in the orders above, by the
+# factor ``_LARGER``. In addition, all terms of tilt and bow may have one common relative error, whose
 # standard deviation is ``_COMMON_SD``. Both numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
 # Number of groups into which the pixels are divided by their expected height.
@@ -51,12 +51,13 @@ class MeasuredRecord(Record):
     """The scan, its agreement with the expected print, and its processing.
 
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
-    ``tilt_um_per_um`` (x, y) is the tilt that was removed, and ``bow_um`` is the range, over the element, of
-    the bow that was removed. ``noise_um`` is the residual at spatial frequencies at which prints have no
-    structure. Levelling also removes the tilt and bow of the print itself; ``removed_sd_um`` is the standard
-    deviation of each term of this tilt and bow. ``position_sd_um`` is the standard deviation of a corner's
-    position along one axis, and ``scale_sd`` is the relative standard deviation of the height scale.
-    ``defect_share`` is the share of the element that shows dust or scars instead of the print.
+    ``tilt_um_per_um`` (x, y) is the removed tilt, and ``bow_um`` is the height range of the removed bow over
+    the element. ``noise_um`` is the standard deviation of the noise, from spatial frequencies at which prints
+    have no structure. The print itself may also have tilt and bow, which levelling removes as well;
+    ``removed_sd_um`` is the standard deviation of each term that may be lost in this way. ``position_sd_um``
+    is the standard deviation of the position of a corner along one axis, and ``scale_sd`` is the relative
+    standard deviation of the height scale. ``defect_share`` is the share of the element that shows dust or
+    scars instead of the print.
     """
 
     name: str
@@ -112,8 +113,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
     set so that the median difference between the measured and the expected print is 0. The expected print is
     the one that was predicted when the layout was designed. Tilt and bow of the scanner are fitted together
-    with the gain of the expected print, so that no part of the shape of the design is removed. Unmeasured
-    pixels are filled with the heights of the expected print.
+    with the gain of the expected print, so that the tilt and bow of the expected print are not removed.
+    Unmeasured pixels are filled with the heights of the expected print.
 
     Args:
         loaded: the design.
@@ -185,8 +186,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
-    """Remove from a scan the widening of structures that the AFM tip caused. Return the corrected scan, the
-    radius of the tip, µm, and the rms change of the heights, µm.
+    """Correct a scan for the AFM tip, which makes structures wider. Return the corrected scan, the radius of
+    the tip, µm, and the rms change of the heights, µm.
     """
     from litho_data.tip import estimate_tip, paraboloid_erosion
 
@@ -206,12 +207,13 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
 def _defects(off_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return a mask of dust and scars.
 
-    Dust lies in few places. Where many other places of the same expected height deviate, too, the printer is
-    the cause. A deviation at a height that occurs nowhere else counts as dust.
+    A spot of deviating pixels counts as dust if few of the other pixels with the same expected height
+    deviate. If many of them deviate, the printer is the cause. If no other pixel has this expected height,
+    the spot counts as dust.
 
     Args:
-        off_um: deviation of a print from the expected print after tilt and bow are removed, shape (ny, nx).
-            It is zero where nothing was measured.
+        off_um: deviation of a print from the expected print, without tilt and bow, shape (ny, nx). It is zero
+            at unmeasured pixels.
         expected_um: height of the expected print, shape (ny, nx).
         valid: mask of the measured pixels, shape (ny, nx).
     """
@@ -299,8 +301,8 @@ class Background:
 def fitted_background(
     height_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray, pitch_um: float, levelling: Levelling
 ) -> Background:
-    """Fit the tilt and bow of a scan by least squares, together with the gain of the expected print. All maps
-    have shape (ny, nx).
+    """Fit the tilt and bow of a scan, together with the gain of the expected print, by least squares. All
+    maps have shape (ny, nx).
     """
     ny, nx = height_um.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
@@ -321,8 +323,8 @@ def fitted_background(
 
 
 def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, to which random noise as strong as that of the scan is
-    added. The two prints of a pair have the same noise with opposite signs.
+    """Yield pairs of prints of shape (ny, nx), in µm, with added random noise, which is as strong as the
+    noise of the scan. In the two prints of a pair, the same noise has opposite signs.
     """
     generator = np.random.default_rng(0)
     for _ in range(DRAWS):
@@ -344,8 +346,9 @@ def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float)
 
 def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
     """Yield pairs of prints of shape (ny, nx), in µm, that registration and levelling cannot distinguish from
-    the measured one. In a pair, one quantity differs by plus and minus its standard deviation: a term of the
-    print's own tilt and bow, all these terms by the same factor, or a parameter of the affine registration.
+    the measured print. In the two prints of a pair, one quantity differs by plus and minus its standard
+    deviation. This quantity is a term of the print's own tilt and bow, a factor common to all these terms, or
+    a parameter of the affine registration.
     """
     measured = height_um.double().cpu().numpy()
     removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
@@ -360,17 +363,17 @@ def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) 
 
 
 def _pair(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:
-    """Yield the print with the change added and with the change subtracted."""
+    """Yield the print plus the change, and the print minus the change."""
     for sign in (1, -1):
         yield height_um + torch.from_numpy(sign * change_um).to(height_um)
 
 
 def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
-    """Displace a print of shape (ny, nx) by an affine map. If the numbers in ``corner_px``, shape (2, 3), are
-    random with the standard deviation s, the corners move by s px (rms) along each axis.
-
-    For an affine map fitted to points spread evenly over a square, the variance of the shift and the
-    variances of the displacements of an edge by the two linear terms are in the ratio 1 : 3 : 3.
+    """Displace a print of shape (ny, nx) by an affine map. ``corner_px``, shape (2, 3), contains for each
+    axis a shift and two linear terms. If these numbers are random with the standard deviation s, the corners
+    move by s px (rms) along each axis. The three terms are weighted like the errors of an affine map that is
+    fitted to points spread evenly over a square. There, the shift and the displacements of an edge by the two
+    linear terms have variances in the ratio 1 : 3 : 3.
     """
     from scipy.ndimage import affine_transform
 
@@ -383,8 +386,8 @@ def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
 
 
 def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
-    """Return the products of Legendre polynomials in x and y that have the given total orders. Each product
-    has an rms of 1. The result has shape (ny, nx, number of products).
+    """Return all products of a Legendre polynomial in y and one in x whose total order is in ``orders``. Each
+    product has an rms of 1. The result has shape (ny, nx, number of products).
     """
     y, x = (np.linspace(-1, 1, size) for size in shape)
     pairs = [(i, order - i) for order in orders for i in range(order + 1)]
@@ -397,9 +400,9 @@ def _removed_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:
     """Return the standard deviation, µm, that each polynomial term of order 1 or 2 (tilt and bow) may have in
     the print itself.
 
-    First, the mean deviation at every expected height is subtracted from ``off_um``, the deviation from the
-    expected print. The value is ``_LARGER`` times the rms of the terms of orders 3 to 6 in the rest. Both
-    maps have shape (ny, nx).
+    It is extrapolated from finer terms of ``off_um``, the deviation from the expected print. First, the mean
+    deviation at each expected height is subtracted. The result is ``_LARGER`` times the rms of the terms of
+    orders 3 to 6 in the remaining map. Both maps have shape (ny, nx).
     """
     foreign = off_um.ravel().copy()
     for places in np.array_split(np.argsort(expected_um, axis=None), _HEIGHTS):
@@ -409,6 +412,8 @@ def _removed_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:
 
 
 def _amounts(height_um: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Return the coefficients of a map in the orthogonal ``shapes``, shape (ny, nx, n)."""
+    """Return the n coefficients of a map with respect to ``shapes``, which are orthogonal and have shape (ny,
+    nx, n).
+    """
     found: np.ndarray = np.tensordot(height_um, shapes, 2) / height_um.size
     return found

@@ -25,10 +25,10 @@ from litho_design.lenses.objects import read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 
-# Largest accepted standard deviation of the SI-PSNR, in dB. A score that is less certain cannot decide
-# between designs.
+# Largest accepted standard deviation of the SI-PSNR, in dB. With a larger standard deviation, a score cannot
+# decide between designs.
 _LARGEST_SD_DB = 0.5
-# Standard deviation of the effect that a blur of the camera has on a score, as a share of this effect.
+# Relative standard deviation of the effect that a blur of the camera has on a score.
 _BLUR_SD = 0.3
 
 
@@ -47,7 +47,7 @@ class PhotoScore(Record):
 
 
 class LensPhotoScore(Record):
-    """Error, PSNR and SSIM of one photographed object; each image is scaled to minimise its error.
+    """Error, PSNR and SSIM of images of one photographed object. Each image is scaled to minimise its error.
 
     ``direct`` is the photograph itself. ``design`` is the photograph deconvolved with the PSF of the expected
     print. ``calibrated`` is the photograph deconvolved with the PSF of the measured print, or None if the
@@ -107,8 +107,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     image = photo.image()
     variants = photo.with_more_noise(), photo.with_other_faults(), photo.with_other_fits()
     freed, uncertainty = estimated(figures, figures(image), *variants)
-    # If the photograph is blurrier than the expected image, the camera or the print may be the cause. Part of
-    # the effect of this blur on the score therefore remains uncertain.
+    # If the photograph is blurrier than the expected image, the cause may be the camera or the print. The
+    # effect of this blur on the score is therefore added to the uncertainty, in part.
     sharp, soft = (
         photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
         for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))
@@ -155,15 +155,15 @@ def score_lens_photo(
 ) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
-    ``photographed_image`` cleans the photograph and registers it to the image of this object that the
-    expected print would form, on sensor pixels. Then the photograph is deconvolved by the Richardson-Lucy
-    algorithm with the number of iterations of the design. The image of the object must be as large as in the
-    design; otherwise, the PSFs do not apply.
+    ``photographed_image`` cleans the photograph and registers it to the expected image, i.e. the image of
+    this object on sensor pixels that the expected print would form. Then the photograph is deconvolved by the
+    Richardson-Lucy algorithm with the number of iterations of the design. The image of the object must be as
+    large as in the design; otherwise, the PSFs do not apply.
 
     Args:
         loaded: the design of a lens.
-        source: an upright photograph (a lens rotates its image by 180°), or one whose ``orientation`` says
-            how to make it upright.
+        source: an upright photograph, or a photograph whose ``orientation`` says how to make it upright. A
+            lens rotates its image by 180°.
         printed_um: measured height of the print, µm, shape (size, size), from which the calibrated PSF is
             computed.
 

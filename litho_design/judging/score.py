@@ -1,5 +1,5 @@
-"""Score a design by the print that models predict, by a measured print, or by a photograph. The score is
-always that of the layout with integer levels, which can be printed.
+"""Score a design by the print that models predict, by a measured print, or by a photograph. The scored layout
+always has integer levels, so it can be printed.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ from litho_design.tasks.design import Design
 class JudgedScore(Record):
     """The scores of a design from one judge, which is a model, a measured print or a photographed image.
 
-    ``uncertainty`` contains the standard deviation of each measured score. It is None if the judge is a
-    model.
+    ``uncertainty`` contains the standard deviation of each score. It is None if the judge is a model.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"stitching"})
@@ -54,7 +53,8 @@ class JudgedScore(Record):
     uncertainty: dict[str, float] | None = None
 
     def remarks(self) -> list[str]:
-        """Return remarks on the processing of a measurement and on its uncertainties, one phrase each."""
+        """Return remarks on the processing of a measurement, one phrase each. The list is empty for a model.
+        """
         return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 
@@ -76,7 +76,8 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
-    # Gain in score of the design over the best uncorrected layout. It is None if the two were not compared.
+    # Gain of the design over the best uncorrected layout (see ``Width.gain``). It is None if no uncorrected
+    # layout was compared.
     gain: float | None = None
 
     @classmethod
@@ -130,8 +131,8 @@ def judge_design(
     """Score the layout of a design by the predictions of models, a measured print and a photograph.
 
     Args:
-        judges: printers. A printer with the same weights as a model that the search used is marked as not
-            independent.
+        judges: printers. If a printer has the same weights as a model that the search used, its score is
+            marked as not independent.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
             ``scan`` is given, the photograph of an object is also deconvolved with the PSF of the measured
