@@ -53,8 +53,7 @@ class JudgedScore(Record):
     uncertainty: dict[str, float] | None = None
 
     def remarks(self) -> list[str]:
-        """Return remarks on the processing of a measurement, one phrase each. The list is empty for a model.
-        """
+        """Return remarks on the processing of a measurement, one phrase each. A model has none."""
         return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 
