@@ -1,3 +1,3 @@
-"""Design elements that are too large for one process. The element is divided into bands of rows, which are
-distributed among several processes.
+"""The design of elements that are too large for one process. An element is divided into bands of rows, and
+several processes share the bands.
 """

@@ -1,7 +1,7 @@
 """Divide a large element into bands of rows. Its print and the light behind it are computed band by band.
 
-The bands depend only on the layout. An element has the same bands, numbered in the same way, whether one
-process or many compute them.
+The bands depend only on the layout. One process and many processes use the same bands, numbered in the same
+way.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from litho_design.optimisation.ranks import ALONE, Ranks
 from litho_design.printers.printer import Printer
 
 # Default for the largest number of rows in a band. The memory that a print needs grows with the square of
-# this number, and no more processes can share an element than it has bands. If a band has fewer rows than
-# about four times the model's reach (the distance up to which a level affects the print), most of the time is
-# spent on rows whose print is computed twice.
+# this number. There cannot be more processes than bands. If a band has fewer rows than about four times the
+# model's reach (the distance up to which a level affects the print), most of the time is spent on rows whose
+# print is computed twice.
 BAND_PX = 512
 
 
@@ -70,14 +70,14 @@ class Bands:
         return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
 
     def own(self) -> list[slice]:
-        """Return the bands of this process as slices. Each slice selects rows from those that the process
+        """Return the bands of this process as slices. They are slices of the array of rows that the process
         holds.
         """
         rows = len(self.rows())
         return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
 
     def check_halo(self, halo: int) -> None:
-        """Check that the bands have so many rows that no row lies in the halos of two other bands.
+        """Check that the bands have enough rows, so that no row lies in the halos of two other bands.
 
         Raises:
             InputError: a band has fewer rows than twice the halo, or the last band has fewer rows than the
@@ -112,13 +112,13 @@ class Bands:
 
 
 def require_reach(printer: Printer) -> None:
-    """Check that the print of an element can be predicted in parts.
+    """Check that ``printer`` can predict the print of an element in parts.
 
     Raises:
         InputError: according to the printer model, the print at one place depends on the whole layout or on
             the position in the write field.
     """
-    # A virtual fab states no halo, because it frames the layout itself and prints it as a whole.
+    # A virtual fab has no halo. It adds the frame of level 0 itself and prints the layout as a whole.
     no_reach = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
     whole = no_reach or printer.only_judges
     if whole or printer.depends_on_position:

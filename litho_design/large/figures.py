@@ -51,7 +51,9 @@ def _sums(share: np.ndarray, aim: np.ndarray) -> list[float]:
 
 
 def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands) -> tuple[float, float]:
-    """Return the SSIM at the matched scale, and the share of pixels that this scale clips."""
+    """Return the SSIM of the image multiplied by ``scale``, and the share of pixels that exceed 1 after this
+    multiplication and are clipped.
+    """
     around = SSIM_WINDOW_PX // 2
     size, total, clipped = bands.size_px, 0.0, 0
     for band in bands.own():
@@ -59,7 +61,7 @@ def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands)
         seen, aim = _read(image, target, slice(first, last))
         seen *= scale
         clipped += int((seen[band.start - first : band.stop - first] > 1).sum())
-        # Windows that extend beyond the edge of the element do not count.
+        # Pixels whose window extends beyond the edge of the element are left out.
         inner = slice(max(band.start, around) - first, min(band.stop, size - around) - first)
         total += float(ssim_map(seen.clip(0, 1), aim)[inner, around : size - around].sum())
     return total / (size - 2 * around) ** 2, clipped / size**2

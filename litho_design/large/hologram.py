@@ -1,5 +1,5 @@
-"""The task of designing a hologram in bands. In contrast to ``HologramTask``, each process holds only its own
-rows of the hologram.
+"""The task of designing a hologram in bands. Unlike in ``HologramTask``, each process holds only its own rows
+of the hologram.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _LEFT_OUT = (
     "that need the whole image at once"
 )
 _PREVIEW_PX = 1024
-# Settings of the light, of the search and of the hologram that are restricted for a large element. Each is
-# mapped to the only value that is supported.
+# Settings of the light, of the search and of the hologram for which a large element supports only one value,
+# and this value.
 LIGHT: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
@@ -55,8 +55,8 @@ HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "no
 
 
 class BandedHologram(HologramTask):
-    """A hologram whose rows are divided among several processes. Each process obtains the loss of the whole
-    element.
+    """The task of a hologram whose rows are divided among several processes. Each process obtains the loss of
+    the whole element.
 
     All processes run this task with the same arguments, and all of them must be able to write to the same
     folder. The resulting layout does not depend on the number of processes.
@@ -105,8 +105,8 @@ class BandedHologram(HologramTask):
         self.bands.check_halo(printer.halo_px)
 
     def inputs_sha256(self) -> str:
-        """Return a string that identifies the bands. The bands determine how sums are rounded, and thereby
-        affect the layout.
+        """Return a string that identifies the bands. It is used because the rounding of sums, and thus the
+        layout, depends on the bands.
         """
         return f"bands of {self.bands.band_px}"
 
@@ -131,8 +131,8 @@ class BandedHologram(HologramTask):
         the rows of this process, shape (1, 1, rows, size).
         """
         loss, parts = super().objective(level)
-        # Every process returns the loss of the whole element, but in the gradient, which is summed over the
-        # processes, this loss must count only once.
+        # Every process returns the loss of the whole element. The gradient is summed over the processes, so
+        # each process contributes only its share.
         return (loss - loss.detach()) / self.ranks.count + loss.detach(), parts
 
     @torch.no_grad()
@@ -147,8 +147,8 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write the arrays of the design, to which all processes contribute their rows. The first process
-        returns the SHA-256 hashes, keyed by file name; the others return an empty dict.
+        """Write the arrays of the design; every process writes its own rows. The first process returns a dict
+        from file name to SHA-256; the others return an empty dict.
         """
         arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: self.bench(height_um)}
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
@@ -186,22 +186,22 @@ class BandedBench(nn.Module):
         self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
     def illumination(self) -> Tensor:
-        """Return the wave behind the rows of a flat element that this process holds, as complex128 of shape
-        (rows, size).
+        """Return the wave behind a flat element, in the rows of this process, complex128 of shape (rows,
+        size).
         """
         return flat_field(self.rows, self.optics, pixels=self.pixels)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the share of the incident power on each pixel of the image plane that this process holds,
-        shape (rows, size). ``height_um`` contains the heights in the rows of this process.
+        """Return the share of the incident power on each pixel of the image plane, shape (rows, size). The
+        result and ``height_um`` contain only the rows of this process.
         """
         field = element_field(height_um, self.rows, self.optics, pixels=self.pixels)
         return intensity_share(self.propagator(field), self.rows)
 
 
 def only(settings: Record, values: dict[str, Any]) -> None:
-    """Check that settings are supported for a large element. ``values`` maps the path of each restricted
-    setting to the only value that is allowed.
+    """Check that the settings in ``values`` have the values that are supported for a large element.
+    ``values`` maps the path of each of these settings to its only supported value.
 
     Raises:
         InputError: a setting has a different value.
@@ -216,8 +216,8 @@ def only(settings: Record, values: dict[str, Any]) -> None:
 
 
 def _write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[str, str]:
-    """Write each array to one file, to which every process contributes its rows, shape (rows, size). The
-    first process returns a dict from file name to SHA-256; the others return an empty dict.
+    """Write each array to one file. Every process writes its own rows, shape (rows, size), into this file.
+    The first process returns a dict from file name to SHA-256; the others return an empty dict.
     """
     size, rows, hashes = bands.size_px, bands.rows(), {}
     for name, values in arrays.items():

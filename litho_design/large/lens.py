@@ -1,7 +1,6 @@
-"""Design a lens of any size ring by ring: the print and the light are computed only along one radius.
-
-Light and print are never computed on the whole plane, because an element that is 10 mm wide has 10¹⁰ pixels
-but only 50,000 rings of 0.1 µm.
+"""Design a lens of any size ring by ring. The print and the light are computed only along one radius and
+never on the whole plane, because an element that is 10 mm wide has 10¹⁰ pixels but only 50,000 rings of 0.1
+µm.
 """
 
 from __future__ import annotations
@@ -45,8 +44,9 @@ class RadiusMap(CellMap):
         self.cells = self.of_all = (int(self.ring[-1]) + 1,)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the mean of real or complex pixel values over each ring. The pixels lie along one radius,
-        and each is weighted with the area of the circular ring of pixels that it represents.
+        """Return the mean of real or complex pixel values over each ring. The pixels lie along one radius.
+        Each pixel represents all pixels at the same radius, so it is weighted with the area of the circle on
+        which they lie.
         """
         area = self.area.to(pixels)
         sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
@@ -81,7 +81,7 @@ class RingLens(DirectLensTask):
         require_reach(printer)
 
     def inputs_sha256(self) -> str:
-        """Return a constant, because the layout depends only on the settings and on no other input."""
+        """Return a constant, because a lens has no inputs besides the settings."""
         return "rings"
 
     def make_cells(self) -> CellMap:
@@ -93,13 +93,13 @@ class RingLens(DirectLensTask):
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the existing bench for every draw of the process window, because the matrix of a new bench
-        takes long to compute. The search therefore considers only the lens as modelled.
+        """Return the existing bench, whatever the optics. A new bench for each draw of the process window
+        would take too long, because of its matrix. The search therefore uses only the optics in the settings.
         """
         return self.bench
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose print comes closest to the heights of a perfect lens."""
+        """Return the levels whose printed phases come closest to the phases of a perfect lens."""
         ideal = self.bench.ideal_height_um().double() * (2 * math.pi / self.settings.optics.wave_height_um)
         wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
         return focusing_levels(wave.angle().float().cpu(), level_phase.cpu())

@@ -1,9 +1,9 @@
 """Propagate a wave to a parallel plane by a Fourier transform that several processes share.
 
-Each process transforms its own rows. The processes then exchange data, so that each of them has whole
-columns, which it transforms, multiplies by the transfer function and transforms back. A second exchange
-restores the rows. The method is the transposed form of the two-dimensional transform (Takahashi, Fast Fourier
-Transform Algorithms for Parallel Computers, ch. 8).
+Each process transforms its own rows. Then the processes exchange data, so that each process has whole
+columns. It transforms them, multiplies them by the transfer function and transforms them back. A second
+exchange restores the rows. The method is the transposed form of the two-dimensional transform (Takahashi,
+Fast Fourier Transform Algorithms for Parallel Computers, ch. 8).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _COLUMNS = 256
 
 
 class BandedPropagator:
-    """A propagator between equal grids, like the one that ``make_propagator`` returns, for a field whose rows
-    are divided among several processes.
+    """A propagator between equal grids for a field whose rows are divided among several processes. It
+    computes the same as the propagator from ``make_propagator``.
 
     The field and the result contain only the rows of this process, as complex64 of shape (rows, size). The
     kernel is even along both axes, so only half of each column of its Fourier transform is stored.
@@ -69,7 +69,7 @@ class BandedPropagator:
         return carried
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply P^H, the adjoint of the propagation, which sends a field back."""
+        """Apply P^H, the adjoint of the propagation, to a field."""
         return self.carried(field, conjugate=True)
 
     def carried(self, field: Tensor, *, conjugate: bool = False) -> Tensor:
@@ -147,9 +147,9 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space. For a small element, the period that is needed to keep
-        steep rays from wrapping around is longer than the Fourier transform of this propagator. In this case,
-        the kernel of ``ASMPropagator`` is used.
+        """Compute the transfer function of free space. In a small element, steep rays would wrap around
+        within the length of the Fourier transform of this propagator. In this case, the kernel of
+        ``ASMPropagator`` is used, which has a longer period.
         """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]

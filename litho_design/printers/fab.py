@@ -1,8 +1,7 @@
 """The virtual fab (a simulated printer) as a judge of designs. It can print finished layouts, but it provides
-no gradients, so no layout can be designed through it.
-
-The fab shares no code with the models. It includes the hidden effects with which the training prints of the
-models were simulated, so its print of a layout is the one that the simulated machine would produce.
+no gradients, so no layout can be designed with it. The fab shares no code with the models. It includes the
+hidden effects with which the training prints were simulated, so it prints a layout exactly as the simulated
+printer would.
 """
 
 from __future__ import annotations
@@ -39,15 +38,13 @@ class ElementJob(Job):
 
 
 class FabSimulator(nn.Module):
-    """Print like the virtual fab described by a ``truth.json``, with surface roughness but without scan
-    effects.
-
-    The fab is called like a frozen model but provides no gradients. The roughness is the same for all layouts
-    of the same size, so differences between their prints come only from the layouts.
+    """The virtual fab that a ``truth.json`` describes, called like a frozen model. Its prints have surface
+    roughness but no effects of a scan. It provides no gradients. The roughness is the same for all layouts of
+    the same size, so differences between their prints come only from the layouts.
     """
 
     name = "fab"
-    # The printer adds no guard ring, because the print job itself adds a frame of level 0.
+    # ``Printer`` adds no guard ring, because ``ElementJob`` already adds a frame of level 0.
     guard_px = 0
 
     def __init__(self, truth: Truth):
@@ -55,8 +52,8 @@ class FabSimulator(nn.Module):
         self.printer, self.noise = truth.printer, truth.noise
         self.knobs = KnobBoard([knob.setting for knob in truth.knobs], truth.seed)
         self.scans, self.seed = len(truth.scans), truth.seed
-        # This text contains everything that determines the print. Its hash identifies the fab, just as the
-        # hash of the weights identifies a model.
+        # This text contains everything that determines the print. The hash of the text identifies the fab,
+        # just as the hash of its weights identifies a model.
         text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
         self.register_buffer("settings", torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8))
 

@@ -11,9 +11,10 @@ from litho_data.foundation.results import Record
 
 
 class LayoutSettings(Record):
-    """Geometry of a layout: its pixels, its free cells (the areas whose level is chosen) and its levels.
+    """Geometry of a layout: its pixels, its free cells (areas with one level each, which the design chooses)
+    and its levels.
 
-    ``cell_um`` is the side of one free cell, or the width of one ring with ``symmetry="radial"``.
+    ``cell_um`` is the side of a free cell or, if ``symmetry`` is "radial", the width of a ring.
     """
 
     size_px: int = setting(1024, "Side of the element", unit="px", option="--size-px", ge=4)

@@ -1,4 +1,4 @@
-"""A printer for one element, which turns the levels of a layout into printed heights."""
+"""A printer for one element. It turns the levels of a layout into printed heights."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ Precision = Literal["float32", "bfloat16"]
 
 
 class TilingCheck(Record):
-    """Difference between the print of a layout that is predicted as a whole and the print that is predicted
-    in tiles.
+    """Difference between two predictions of the same print: one for the whole layout, the other in tiles.
 
     For models with a finite reach, the difference is only a rounding error. For other models, such as a
     Fourier neural operator, the difference is an error of the model.
@@ -35,8 +34,8 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """The record of the printer that was used for a design or a score; ``dataset_sha256`` identifies the
-    dataset on which its model was trained.
+    """The printer that was used for a design or a score. ``dataset_sha256`` identifies the dataset on which
+    the model of this printer was trained.
     """
 
     name: str
@@ -106,8 +105,8 @@ class Printer(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Return the device of the model. If the heights are nominal, this is the device on which the waves
-        are computed.
+        """Return the device of the printer. It is also set for nominal heights, which have no model: waves
+        are computed on it.
         """
         return self.device_marker.device
 
@@ -117,8 +116,8 @@ class Printer(nn.Module):
         return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
     def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
-        """Return the printed height, µm, of a patch cut out of a layout, without the outer ``halo_px`` pixels
-        of the patch. The levels of the patch have shape (b, 1, y, x).
+        """Predict the print of a patch of a layout. Return the printed height, µm, without the outer
+        ``halo_px`` pixels of the patch. The levels of the patch have shape (b, 1, y, x).
 
         By default, ``halo_px`` is the halo of the printer. If only two rows remain inside the halo, the
         narrower ``strip_halo_px`` is enough.
@@ -170,8 +169,8 @@ class Printer(nn.Module):
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
         count = min(4, size // tile_px)
-        # Tiles start at odd pixels, so that none coincides with a tile into which the model itself divides
-        # the layout. Otherwise, that tile would be compared with itself.
+        # Tiles start at odd pixels, so that none of them coincides with an internal tile of the model. Such a
+        # tile would be compared with itself.
         starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
         off = []
         for start in (min(start, size - tile_px) for start in starts):
@@ -187,15 +186,14 @@ class Printer(nn.Module):
         )
 
     def at_precision(self, precision: Precision) -> AbstractContextManager[None]:
-        """Return a context manager, inside which the networks of a frozen model run in ``precision``.
-
-        Models without this option stay in float32, and so do heights, blurs and waves.
+        """Return a context manager. Inside it, the networks of a frozen model run in ``precision``, if the
+        model supports this. Heights, blurs and waves stay in float32.
         """
         at_precision = getattr(self.simulator, "at_precision", None)
         return nullcontext() if at_precision is None else at_precision(precision)
 
     def record(self) -> PrinterRecord:
-        """Return the record of the printer that results contain: its name, its hashes and its guard ring."""
+        """Return the record of this printer for results: its name, its hashes and its guard ring."""
         return PrinterRecord(
             name=self.name,
             sha256=self.weights_sha256(),
@@ -206,8 +204,8 @@ class Printer(nn.Module):
         )
 
     def weights_sha256(self) -> str:
-        """Return the hash of the current values of all parameters and buffers, which a design run must not
-        change.
+        """Return the hash of the current values of all parameters and buffers. The hash must not change
+        during a design run.
         """
         digest = hashlib.sha256()
         state = {} if self.simulator is None else self.simulator.state_dict()
@@ -249,9 +247,9 @@ def _borders_px(simulator: Any) -> tuple[int, int, int]:
     """Return three widths in pixels: of the guard ring, of the halo of a patch, and of the halo of a two-row
     strip.
 
-    A model that itself runs on tiles needs the width of a whole tile around a patch. A strip can have a
-    narrower halo: its two rows lie where the model blends two rows of tiles, and the mean of two tiles has a
-    smaller error there than a single tile.
+    If a model runs on tiles internally, a patch needs a halo as wide as a tile. A strip of two rows can have
+    a narrower halo. The strip lies where the model blends two rows of tiles, and there, the mean of two tiles
+    has a smaller error than a single tile.
     """
     guard = simulator.guard_px
     tile = getattr(simulator, "tile", None)

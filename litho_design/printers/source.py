@@ -31,9 +31,9 @@ def load_printer(
     """Load the printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal
     heights.
 
-    The folder ``truth`` of a virtual fab is loaded as a printer that can judge layouts but not take part in a
-    search. ``name`` is the name of the printer in results; by default, it is the name of the model. A loaded
-    printer is returned unchanged.
+    ``source`` may also be the folder ``truth`` of a virtual fab. The fab can judge layouts, but a search
+    cannot use it. ``name`` is the name of the printer in results; by default, it is the name of the model. A
+    loaded printer is returned unchanged.
 
     Raises:
         InputError: ``source`` does not name a frozen model, the pitch of the model differs from that of the
@@ -104,14 +104,14 @@ def models_at_hand(
     """Load those models of the zoo in ``JUDGES`` that were trained on the same prints as the first of the
     ``known`` models.
 
-    Models that are already known, and models that were not calibrated for the layout, are left out.
+    The ``known`` models themselves are left out, and so are models that were not calibrated for the layout.
     """
     from litho_models import zoo
 
     dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
     for name in JUDGES if dataset else ():
-        # Models are selected by their cards, so that models of another printer need not be loaded.
+        # Models are selected by their cards, so that the models of other printers need not be loaded.
         card = zoo.card(name)
         if (card.get("dataset") or {}).get("sha256") != dataset:
             continue

@@ -1,5 +1,5 @@
-"""Compare a layout with the training layouts of a model: compute the distance between them, a penalty on this
-distance for the search, and the expected error of the model.
+"""Compare a layout with the training layouts of a model. The module computes the distance between them, a
+penalty for the search, and the expected error of the model.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from litho_design.printers.layout import LayoutSettings
 if TYPE_CHECKING:
     from torch import Tensor
 
-# If half of the pixels have levels that are rare in the training layouts, most of the print is extrapolated.
+# A layout is flagged if its histogram of levels differs from the training layouts for more than half of the
+# pixels. Most of its print is then extrapolated.
 _FLAG_DISTANCE = 0.5
-# A layout is flagged if the histograms of steps differ for more than a tenth of all pairs of neighbouring
-# pixels. A few edges do not make a layout unusual.
+# A layout is also flagged if the histograms of steps differ for more than a tenth of all pairs of
+# neighbouring pixels. A few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
-# A level or step is unusual if its share exceeds its share in the training layouts both by this factor and by
-# this difference.
+# A level or step is unusual if it is more frequent than in the training layouts, both by more than this
+# factor and by more than this difference of the shares.
 ALLOWED_TIMES = 2.0
 _ALLOWED_SHARE = 0.005
 
@@ -37,8 +38,8 @@ class OutOfDistribution(Record):
     histogram of steps.
     """
 
-    # Records of earlier versions contain further fields: the scores of a layout that is closer to the
-    # training layouts.
+    # Records of earlier versions also contain the scores of a second layout, which is closer to the training
+    # layouts. They are ignored.
     model_config = ConfigDict(extra="ignore")
 
     level_distance: float
@@ -80,13 +81,11 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """Return the penalty on a layout that is unlike the training layouts: the amount, in levels, by which the
-    tails of its histograms of levels and steps exceed twice those of the training layouts.
-
-    For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
-    neighbours with steps of k or more. A share may be up to twice the corresponding share of the training
-    layouts, and the result is the sum of all excesses. If the card has no histogram, the result is 0. Because
-    these shares are cumulative, the penalty also pulls back a pixel that lies several levels outside the
+    """Return the penalty on a layout whose levels and steps are unlike those in the training layouts. For
+    every k, three shares are computed: the pixels at level k or higher, the pixels at lower levels, and the
+    neighbours with steps of k or more. A share may be up to twice the same share of the training layouts, and
+    the penalty is the sum of all excesses. If the card has no histogram, the penalty is 0. Because these
+    shares are cumulative, the penalty has a gradient even at a pixel that lies several levels outside the
     training layouts.
     """
     total = level.new_zeros(())
@@ -108,8 +107,8 @@ def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
 
 
 def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:
-    """Return a histogram from a model's card, scaled to a sum of 1 and extended to at least ``levels``
-    values. Return None if the card does not contain it.
+    """Return the histogram ``name`` from a model's card, scaled to a sum of 1 and extended by zeros to at
+    least ``levels`` values. Return None if the card has no such histogram.
     """
     trained = np.asarray(card.get(name) or [], dtype=float)
     if trained.size == 0:
@@ -121,10 +120,11 @@ def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
     """Return the rms error, µm, that a model is expected to make on the print of a relief. ``relief_um`` is
     the standard deviation of the heights of this relief, µm.
 
-    Two errors are added in quadrature: the error on the prints in the model's card, and the scatter of the
-    gains of these prints times ``relief_um``. If the relief is higher than these prints, the first error is
-    scaled up. The card states mean absolute errors; they are multiplied by sqrt(pi / 2) to obtain rms errors,
-    because errors are assumed to be normally distributed. If the card has no prints, the result is 0.
+    Two errors are added in quadrature. The first is the error on the prints in the model's card; it is scaled
+    up if the relief is higher than these prints. The second is the standard deviation of the gains of these
+    prints, multiplied by ``relief_um``. The card states mean absolute errors; they are multiplied by sqrt(pi
+    / 2) to obtain rms errors, because errors are assumed to be normally distributed. If the card has no
+    prints, the result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:

@@ -1,5 +1,5 @@
-"""Measure the design-to-manufacturing gap: make a design with every arm (printer model, or none), and predict
-its print with every judge (model).
+"""Measure the design-to-manufacturing gap. A design is made with every arm (a printer model, or none), and
+every judge (a model) predicts the print of every design.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ def compare(
     every judge.
 
     An arm is the printer model, or none, with which a design is made. A judge is a model that predicts the
-    print of a finished layout. All arms share every setting except the printer. Finished designs in ``out``
-    are reused, and interrupted designs resume. The printers of all arms are also judges.
+    print of a finished layout. The settings of all designs are the same, except for the printer and the seed.
+    Finished designs in ``out`` are reused, and interrupted designs resume. The printers of all arms are also
+    judges.
 
     Args:
         settings: settings of a hologram or of a lens; their type decides which of the two is designed. If
@@ -162,9 +163,7 @@ def _judged(
     place: Path, arm: str, seed: int, printers: Mapping[str, Printer]
 ) -> tuple[list[GapEntry], list[Panel]]:
     """Predict the print of a finished design with every printer. Return one entry and one picture per
-    printer.
-
-    The pictures begin with the target image, if the design has one.
+    printer. If the design has a target image, this image precedes the pictures.
     """
     loaded = load_design(place, device=printers[arm].device)
     expected = loaded.printed_um(printers[arm])

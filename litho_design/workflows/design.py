@@ -1,4 +1,4 @@
-"""Design an element through a frozen model of the printer, and write the result into a folder."""
+"""Design an element with a frozen model of the printer, and write the result into a folder."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class How(TypedDict, total=False):
     """Arguments that all design functions share.
 
     Attributes:
-        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of the
-            scores according to these models is the width of the design. By default, the judges are the zoo's
+        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The width of the
+            design is the range of the scores that these models predict. By default, the judges are the zoo's
             models that were trained on the same prints as the model of the design.
-        robust: let the search also use those judges that have gradients. ``Task.over_models`` then combines
-            the losses of all models, and a penalty on the disagreement of the models is added.
+        robust: use the judges that have gradients in the search, too. ``Task.over_models`` then combines the
+            losses according to all models, and a penalty on the disagreement of the models is added.
         device: torch device on which prints and waves are computed.
         extrapolate: accept heights beyond the range for which a model was calibrated; the result records this
             choice.
@@ -126,8 +126,8 @@ def design_lens(
             drawings.
         held_out_objects: pictures, or folders of pictures, that are used only for the scores and not in the
             search (see ``with_objects``).
-        tile_px: if given, only the rings of a focusing lens are designed: the print of a strip along one
-            radius is predicted in tiles of this many pixels. The whole plane is not computed, so the lens may
+        tile_px: if given, a focusing lens is designed ring by ring, and the whole plane is never computed.
+            The print of a strip along one radius is predicted in tiles of this many pixels. The lens may then
             be 10 mm wide or more. The model must have a finite reach.
         how: see ``How``.
 
@@ -170,9 +170,9 @@ def correct(
             in µm, or an array of heights in µm of shape (size_px, size_px) (see ``load_relief``).
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
-        after: folder of a first correction that was printed and measured.
-        scan: measurement of the print of the first correction. The next print is expected to deviate from the
-            prediction of each model in the same way as the first print did.
+        after: folder of an earlier result of ``correct``, whose layout was printed and measured.
+        scan: measurement of the print of that layout. The next print is expected to deviate from the
+            prediction of each model in the same way as this print did.
         how: see ``How``; ``robust`` is True by default.
 
     Returns:
@@ -267,8 +267,8 @@ def _designed(
     extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """Run the design of the task that ``make`` returns. The printers are checked before ``make`` reads a
-    target.
+    """Run the design of the task that ``make`` returns. The printers are checked before ``make`` is called
+    and reads a target.
     """
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)

@@ -1,4 +1,4 @@
-"""A first result for new users. A small hologram is designed once without and once with a printer model, and
+"""A first result for new users. A small hologram is designed twice, without and with a printer model, and
 this model predicts the prints of both designs.
 """
 
@@ -14,8 +14,8 @@ from litho_design.judging.gap import GapResult
 from litho_design.printers.source import Device
 from litho_design.workflows.compare import compare
 
-# Names of three printers: nominal heights, for which the first design is made; the model for which the second
-# design is made; and a model that only predicts the prints of both designs.
+# Names of three printers. The first design is made with nominal heights, and the second design with a model.
+# The third printer is a model that only predicts the prints of both designs.
 WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
@@ -41,14 +41,14 @@ def first(
     device: Device = "cpu",
     announce: bool = True,
 ) -> GapResult:
-    """Design the same hologram twice, once for a perfect printer and once through the printer model PBL, and
+    """Design the same hologram twice, once for a perfect printer and once with the printer model PBL, and
     predict both prints with PBL.
 
     Args:
         out: folder of the result. The page ``report.html`` in it shows the target and the images behind both
             prints side by side.
         target: as for ``design_hologram``.
-        settings: settings of both designs; by default, those of ``small_hologram``.
+        settings: settings of both designs; by default, the result of ``small_hologram``.
         device, announce: as for ``design_hologram``.
 
     Returns:

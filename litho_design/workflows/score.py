@@ -1,4 +1,4 @@
-"""Score a finished design by models, a measured print or a photograph, and write the folder of the score."""
+"""Score a finished design by models, a measured print or a photograph, and write the scores into a folder."""
 
 from __future__ import annotations
 
