@@ -1,3 +1,3 @@
-"""A printed optical element for your own programs. A frozen printer model predicts the printed heights from
-the trainable levels of the element, and the heights modulate a wave.
+"""A printed optical element for your own programs. The element has trainable levels. A frozen printer model
+predicts the printed heights of these levels, and the heights modulate a wave.
 """

@@ -40,11 +40,11 @@ class Element(nn.Module):
     behind the element.
 
     The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and
-    clipped to the range of the layout; a straight-through estimator gives the gradient of this step. A frozen
+    clipped to the range of the layout. The gradient ignores this step (straight-through estimator). A frozen
     model predicts the print of these levels, which are surrounded by a guard ring of level 0. The printed
     height h delays the wave by the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The wave
-    therefore always belongs to a printable layout. During the first steps of a search, you can set
-    ``element.whole = False`` to leave the levels unrounded.
+    therefore always belongs to a printable layout. If you set ``element.whole = False``, for example during
+    the first steps of a search, the levels are not rounded.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
@@ -56,9 +56,9 @@ class Element(nn.Module):
         kind: ``thin`` or ``thick``. For ``thick``, the wave is propagated through the relief by the wave
             propagation method; the relief must be in air.
         tile_px: side, in pixels, of the overlapping tiles into which an element larger than one tile is
-            divided. The prints of the tiles are predicted one after the other, and the backward pass
-            recomputes them, so the memory needed depends on the size of a tile and not on that of the
-            element. With None, the print of the whole element is predicted at once.
+            divided. The prints of the tiles are predicted one after the other, and again in the backward
+            pass, so the memory needed depends on the tiles and not on the size of the element. If None, the
+            print of the whole element is predicted at once.
         seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
@@ -191,7 +191,8 @@ class Element(nn.Module):
         if not ((pixels >= 0) & (pixels <= highest)).all():
             raise InputError(what, got=f"{pixels.min():g} to {pixels.max():g}", wanted=f"0 to {highest}")
         values = self.free.cells.average(pixels)
-        # Averages over a cell are rounded to float32, so equal levels may differ slightly from their average.
+        # Averages over a cell are rounded to float32, so the levels of a cell may differ slightly from their
+        # average even if they are equal.
         if (self.free.cells(values) - pixels).abs().max() > 1e-3:
             cell = "ring" if self.free.cells.radial else "cell"
             raise InputError(
@@ -203,8 +204,8 @@ class Element(nn.Module):
         self.free.start_from(values)
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
-        """Set the free levels to those whose print comes closest to a target phase, apart from a constant
-        phase.
+        """Set the free levels to the levels whose printed phases come closest to a target phase, apart from a
+        constant phase.
 
         ``phase`` is in radians and has shape (size, size).
         """
@@ -223,8 +224,8 @@ class Element(nn.Module):
             unit_um: size of this unit of length in µm, for example 1e6 if your program uses metres.
 
         Raises:
-            InputError: torchoptics is not installed, or the element is thick, so that one complex factor per
-                pixel cannot describe it.
+            InputError: torchoptics is not installed; or the element is thick, which one complex factor per
+                pixel cannot describe.
         """
         try:
             from litho_design.elements.in_torchoptics import PrintedElement

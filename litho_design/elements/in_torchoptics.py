@@ -14,7 +14,7 @@ class PrintedElement(PolychromaticModulationElement):
     same shape and spacing as the element.
 
     Args:
-        element: the printed element, whose parameters become those of this module.
+        element: the printed element. Its parameters become the parameters of this module.
         z, offset: position of the element along and across the axis, as in torchoptics.
         unit_um: size, in µm, of the unit of length that your program uses in torchoptics.
     """
@@ -27,7 +27,7 @@ class PrintedElement(PolychromaticModulationElement):
         self.element, self.unit_um = element, unit_um
 
     def modulation_profile(self, wavelength: Any = None) -> Tensor:
-        """Return the complex transmission of the element at a wavelength, which is given in the unit of
-        length used in torchoptics. The result has shape (size, size).
+        """Return the complex transmission of the element at a wavelength, shape (size, size). The wavelength
+        is given in the unit of length that your program uses in torchoptics.
         """
         return self.element.transmission(float(wavelength_or_default(wavelength)) * self.unit_um)

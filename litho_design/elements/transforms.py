@@ -15,8 +15,8 @@ Print = Callable[[Tensor], Tensor]
 
 
 def printed_anyhow(run: Print, level: Tensor) -> Tensor:
-    """Return ``run(level)``. If a transform of ``torch.func`` cannot trace this call, the call is treated as
-    one opaque operation.
+    """Return ``run(level)``. If a transform of ``torch.func`` cannot trace this call, the call becomes a
+    single operation with its own gradient, which need not be traced.
     """
     if "torch._dynamo" in sys.modules:
         run = torch.compiler.disable(run)
@@ -31,7 +31,7 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
         return printed
 
 
-# ``torch.compiler.disable`` sets this attribute; importing that function would take two seconds.
+# ``torch.compiler.disable`` would set this attribute, but its import takes two seconds.
 printed_anyhow._torchdynamo_disable = True  # type: ignore[attr-defined]
 
 

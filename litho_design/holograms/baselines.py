@@ -33,12 +33,12 @@ def hologram_baselines(
     """Return the scores of a black image and of ideal elements in the optics of ``bench``, keyed by the name
     of the baseline.
 
-    ``diffraction-limited`` is an element whose amplitude and phase may take any values on each pixel. It is
-    found by forty Gerchberg-Saxton steps, and its image has a flat phase. ``continuous phase`` has one
-    arbitrary phase per cell and needs neither a printer nor levels. The search for these phases starts from
-    the result of the Gerchberg-Saxton algorithm and takes a hundred descent steps on the loss of the design.
-    The loss after these steps is one of the scores. ``weighted GS`` also has one phase per cell, found by
-    forty weighted Gerchberg-Saxton steps.
+    ``diffraction-limited`` is an element whose amplitude and phase may take any values on each pixel. Its
+    wave is found by forty Gerchberg-Saxton steps towards an image with a flat phase. ``continuous phase`` has
+    one arbitrary phase per cell, without a printer and levels. These phases are found by a hundred descent
+    steps on the loss of the design, which start from the result of the Gerchberg-Saxton algorithm. The lowest
+    loss is one of the scores. ``weighted GS`` also has one phase per cell, found by forty weighted
+    Gerchberg-Saxton steps.
     """
     parts = settings.layout, settings.optics, settings.loss
     pixels = array_sha256(target.cpu().numpy(), "1", ("y", "x"))
@@ -74,11 +74,11 @@ def _baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Starting from a print, search for the phases of the element that send the most power to the signal.
-    Return the share of the power that reaches the signal.
+    """Search for the phases of the element that send the most power to the signal, starting from a print.
+    Return the share of the incident power that then reaches the signal.
 
     The signal is the set of pixels whose target exceeds 0.5. Each step is u <- exp(j arg P^H S P u), where u
-    is the wave behind the element, P is the propagator and S is the mask of the signal; every pixel has its
+    is the wave behind the element, P is the propagator and S is the mask of the signal. Every pixel has its
     own phase. The operator P^H S P is positive semidefinite, so no step reduces the power, and the result is
     never below the share that the print itself reaches.
     """
@@ -100,8 +100,8 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
 
 @torch.no_grad()
 def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
-    """Return the wave of unit power whose image comes closest to an image with the amplitude sqrt(target) and
-    a flat phase. The wave has shape (size, size).
+    """Return a wave of unit power whose image is close to the amplitude sqrt(target), starting from a flat
+    phase of the image. The wave has shape (size, size).
     """
     wanted = target.sqrt()
     area = math.prod(bench.grid.pitch_um)
@@ -117,7 +117,7 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
-    """Search for the phases of the cells for which the loss of the design is lowest. Return these phases, in
+    """Search for the phases of the cells that minimise the loss of the design. Return these phases, in
     radians, and their loss.
     """
     phase, _ = gerchberg_saxton(

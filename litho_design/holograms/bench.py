@@ -24,8 +24,8 @@ from litho_design.optics import Optics, element_field
 from litho_design.optics.thin_element import flat_field
 from litho_design.tasks.bench import ElementBench
 
-# Pixel side in the image plane and NA of an assumed camera: pixels of 3.45 µm behind an objective with a
-# magnification of 10 and an NA of 0.3. The paper does not state its camera.
+# Side of a camera pixel in the image plane, and NA. The paper does not state its camera, so pixels of 3.45 µm
+# behind an objective with a magnification of 10 and an NA of 0.3 are assumed.
 _CAMERA_PITCH_UM, _CAMERA_NA = 0.345, 0.3
 
 Waves = Sequence[tuple[float, Tensor]]
@@ -36,8 +36,8 @@ class HologramBench(ElementBench):
 
     @torch.no_grad()
     def score(self, height_um: Tensor, target: Tensor) -> HologramScore:
-        """Score the image behind printed heights, µm, against the target image. Both arguments have shape
-        (size, size).
+        """Compare the image behind printed heights, µm, with the target image, and return the scores. Both
+        arguments have shape (size, size).
         """
         element = element_field(height_um, self.grid, self.optics)
         waves = list(self.waves(height_um))
@@ -82,7 +82,8 @@ class WindowedHologramScore(HologramScore):
 def hologram_score(
     waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics
 ) -> HologramScore:
-    """Score the summed intensity of the waves in the image plane against the target image.
+    """Compare the summed intensity of the waves in the image plane with the target image, and return the
+    scores.
 
     The signal consists of the pixels whose target T exceeds 0.5. Before the comparison, the image I is scaled
     by c = sum(I T) / sum(I^2). SSIM is computed on the scaled image, clipped to [0, 1], with a Gaussian
@@ -94,7 +95,7 @@ def hologram_score(
             tensor of shape (m, m).
         element: complex field just behind the element, shape (m, m), from which the zero order is computed.
         target: target image with values in [0, 1], shape (m, m).
-        grid: grid of the pixels in the image plane, which is also that of the element.
+        grid: grid of the pixels in the image plane. The element has the same grid.
     """
     area = math.prod(grid.pitch_um)
     share = _added(waves) * area
@@ -115,8 +116,8 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     """Blur a target image of shape (m, m) to the resolution of an element of the same size.
 
     The target is convolved with the intensity in the focus of a square aperture, sinc^2(2 NA x / wavelength)
-    along both axes, where NA is the ``edge_sine`` of half the side. Outside its window, the target is taken
-    to be dark.
+    along both axes, where NA is the ``edge_sine`` of half the side. The target is treated as dark outside its
+    window.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
@@ -130,7 +131,7 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
 
 
 def zero_order_share(element: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the share of the power behind the element that continues undiffracted.
+    """Return the share of the power behind the element that is in the zero order, i.e. not diffracted.
 
     This is |sum u conj(i)|^2 / (sum |u|^2 sum |i|^2), where u is the wave behind the element and i the wave
     behind a flat element. ``element`` contains u on the pixels of ``grid``.
@@ -146,8 +147,8 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the SSIM between the image that a camera records of the waves and the target, both sampled on
-    the pixels of the camera.
+    """Return the SSIM between a camera image of the waves and the target. Both are sampled on the pixels of
+    the camera.
     """
     import cv2
 

@@ -15,9 +15,9 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Return a boolean mask, shape (size, size), of the pixels on which the error of the image is computed:
-    those within ``signal_window_um`` of a pixel whose target is above zero. Return None if the error is
-    computed on all pixels.
+    """Return a boolean mask, shape (size, size), of the pixels on which the error of the image is computed.
+    The mask is True within a distance of ``signal_window_um`` from a pixel whose target is above zero. Return
+    None if the error is computed on all pixels.
     """
     if not settings.signal_window_um:
         return None
@@ -39,8 +39,8 @@ def hologram_loss(
     Args:
         share: share of the incident power on each pixel of the image, shape (size, size).
         target: target intensity in [0, 1], shape (size, size).
-        counted: boolean mask of the pixels that count in the error, shape (size, size), or None if all pixels
-            count.
+        counted: boolean mask, shape (size, size), of the pixels on which the error is computed, or None for
+            all pixels.
         total: function that sums values over the pixels of the whole image. It is needed only if ``share``,
             ``target`` and ``counted`` cover only a part of the image.
     """

@@ -22,12 +22,12 @@ class HologramLoss(Record):
     """Settings of the loss of a hologram, which is RMSE(target, image) + efficiency_weight * (1 -
     efficiency).
 
-    With ``signal_window_um``, the error is computed only on pixels within this distance of a pixel whose
-    target is above zero. The error ignores light elsewhere (mixed-region amplitude freedom: Pasienski and
-    DeMarco 2008, doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the target:
-    ``paper`` divides the image by its mean, weighted with the target, and ``least-squares`` multiplies it by
-    the factor that gives the smallest error. The efficiency is the share of the incident power on pixels
-    whose target is above zero.
+    If ``signal_window_um`` is above 0, the error is computed only on pixels within this distance of a pixel
+    whose target is above zero. Light elsewhere does not change the error (mixed-region amplitude freedom:
+    Pasienski and DeMarco 2008, doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the
+    target: ``paper`` divides the image by its mean, weighted with the target, and ``least-squares``
+    multiplies it by the factor that gives the smallest error. The efficiency is the share of the incident
+    power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(
@@ -55,9 +55,9 @@ def hologram_settings(
     """Return a preset for a hologram, changed by ``changes``, such as ``{"layout.size_px": 256}``.
 
     ``paper`` has the settings that the paper states: 13 levels, Gumbel-Softmax at temperature 0.5, a random
-    start, 1000 Adam iterations at a learning rate of 0.1, and samples that are the mean level of each cell,
-    weighted with the sampled probabilities. ``authors`` has the settings of the published code: 12 levels,
-    temperature 1, a wavelength of 0.633 µm and a refractive index step of 0.545. After more than ten
+    start, and 1000 Adam iterations at a learning rate of 0.1. The sampled level of a cell is the mean of all
+    levels, weighted with the sampled probabilities. ``authors`` has the settings of the published code: 12
+    levels, temperature 1, a wavelength of 0.633 µm and a refractive index step of 0.545. After more than ten
     iterations without progress, the learning rate is reduced to a tenth. The efficiency term in the code is
     constant, so it is omitted here. docs/from_the_authors_code.md lists the parts of that code that are not
     reproduced. ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then polishes

@@ -31,15 +31,15 @@ class HologramTask(Task):
 
     Args:
         settings: geometry, optics, search and loss (see ``hologram_settings``).
-        printer: printer of a frozen model or of nominal heights.
+        printer: printer that predicts prints with a frozen model, or that prints nominal heights.
         inputs: contains ``target``, the target image at the size of the element. ``load_target`` returns this
             image and its record.
         ensemble: further models in the loss, as for ``Task``.
 
     Raises:
-        InputError: the target does not have the size of the element or lacks dark or bright pixels, the
-            requested start works only for other tasks, or the spreads of the process window exceed the range
-            of the propagator.
+        InputError: the target does not have the size of the element or lacks dark or bright pixels, the task
+            does not support the start in the settings, or the propagator is not valid for some draw of the
+            process window.
     """
 
     name = "hoe"
@@ -50,8 +50,8 @@ class HologramTask(Task):
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
-    # This function sums over the pixels of the whole element, because the target and the cells of this
-    # process may cover only a part of it.
+    # This function sums over the pixels of the whole element. The target and the cells of this process may
+    # cover only a part of the element.
     total: Callable[[Tensor], Tensor] = staticmethod(torch.sum)
 
     def __init__(
@@ -91,8 +91,8 @@ class HologramTask(Task):
         return figures | self._inside_window(seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose print has the phases that ``gerchberg_saxton`` finds. If the start is
-        ``wgs``, the weighted form of the algorithm is used.
+        """Return the levels whose printed phases are nearest to the phases that ``gerchberg_saxton`` finds.
+        If the start is ``wgs``, the weighted form of the algorithm is used.
         """
         search = self.settings.search
         phase, _ = gerchberg_saxton(
@@ -113,8 +113,8 @@ class HologramTask(Task):
             return WindowedHologramScore(**score.model_dump(), **self._inside_window(self.bench(height_um)))
 
     def _too_fine(self, target: np.ndarray) -> list[str]:
-        """Return a list with one note if diffraction will blur the strokes of the target in any layout.
-        Otherwise, return an empty list.
+        """Return a list with one note if the strokes of the target are so narrow that diffraction blurs them,
+        whatever the layout. Otherwise, return an empty list.
         """
         layout, optics, window = self.settings.layout, self.settings.optics, self.settings.window
         stroke_um = stroke_width_px(target) * layout.pitch_um
@@ -124,8 +124,8 @@ class HologramTask(Task):
         # The advised distance is rounded down, so that no stroke is too fine at this distance.
         near_um = rounded_down(stroke_um / finest_um * optics.distance_um)
         near = optics.model_copy(update={"distance_um": near_um})
-        # At a small distance, the image plane of some draws of the process window would lie in front of the
-        # element.
+        # If the advised distance is small, the defocus in some draws of the process window would move the
+        # image plane in front of the element.
         calm_um = allowed_defocus_um(window, near, self.bench.grid, self.bench.window)
         defocus = "or less" if calm_um == window.defocus_sd_um else f"with --defocus-sd-um {calm_um:.2g}"
         closer = f"--distance-um {near_um:.2g} {defocus}, " if calm_um else ""
@@ -142,8 +142,8 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Return the signal efficiency of an ideal element, whose continuous phase sends the most power to
-        the signal. The search for this phase starts from the print.
+        """Return the signal efficiency of an ideal element, i.e. an element whose continuous phase sends the
+        most power to the signal. The search for this phase starts from the print.
         """
         return best_signal_efficiency(self.bench, height_um, self.target)
 

@@ -11,8 +11,8 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ReliefSettings(DesignSettings):
-    """All settings of one relief. The wavelength and the distance do not affect the design; they affect only
-    the stroke (height range in waves) that the report states.
+    """All settings of one relief. The wavelength and the distance do not affect the design. The wavelength
+    affects only the stroke (height range in waves) in the report.
     """
 
     layout: LayoutSettings = setting(LayoutSettings(size_px=256, cell_um=0.1), "Layout")
@@ -20,8 +20,8 @@ class ReliefSettings(DesignSettings):
         SearchSettings(start="inverse", iterations=60, learning_rate=0.3, polish_rounds=150),
         "Search",
     )
-    # The weight is 0, because the loss of a relief is an expected error, which already includes the
-    # disagreement of the models.
+    # The weight is 0, because the loss of a relief already includes the disagreement of the models: it is an
+    # expected error.
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(weight=0), "Several models")
     height_um: float = setting(
         0.6,

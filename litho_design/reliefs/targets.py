@@ -24,11 +24,11 @@ def load_relief(
     Args:
         source: a drawing, a greyscale image, or heights in µm (a float TIFF or an array). The drawings are
             ``height_um`` high: lens (a spherical cap), blaze (four periods of a sawtooth along x) and
-            staircase (six steps along x). The brightest value of an image stands for ``height_um``.
+            staircase (six steps along x). The brightest value of an image becomes the height ``height_um``.
 
     Raises:
-        InputError: the source is neither a drawing nor a readable file, or the heights have another shape or
-            are not numbers.
+        InputError: the source is not a drawing, a readable file or an array; or the heights have another
+            shape or are not numbers.
     """
     size = layout.size_px
     if isinstance(source, np.ndarray):
@@ -49,9 +49,8 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, predicted_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Return the deviation of a print from its predicted print, after blurring it and subtracting its mean.
-
-    The deviation is a float32 array of shape (size, size), in µm.
+    """Return the deviation of a print from its prediction, blurred and without its mean. The result is a
+    float32 array of shape (size, size), in µm.
 
     The blur removes the roughness, which differs from print to print and therefore cannot be corrected.
     """
@@ -66,7 +65,7 @@ def _float_tiff(path: Path) -> np.ndarray | None:
     file.
 
     Raises:
-        InputError: the file is not a readable TIFF in spite of its name.
+        InputError: the file has the name of a TIFF but is not readable as a TIFF.
     """
     if path.suffix.lower() not in (".tif", ".tiff"):
         return None

@@ -26,9 +26,9 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-# The first affine layouts (level = gain * height + zero) that are tried. The first tuple contains their
-# gains, relative to the inverse of the printer's gain. The second contains their positions between the lowest
-# level (0) and the highest level (1).
+# Affine layouts (level = gain * height + zero) from which the search for the best one starts. The first tuple
+# contains gains, relative to the inverse of the printer's gain. The second contains positions between the
+# lowest level (0) and the highest level (1).
 _AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
 _AFFINE_STEPS = 20
 
@@ -45,7 +45,9 @@ class ReliefScore(Record):
 
 
 class _Bare(nn.Module):
-    """The bench of a relief. It returns the heights of a print unchanged, because a relief has no light."""
+    """The bench of a relief. It returns the heights of a print unchanged, because no light is computed for a
+    relief.
+    """
 
     def __init__(self, layout: LayoutSettings):
         super().__init__()
@@ -61,14 +63,13 @@ class ReliefTask(Task):
     and its record.
 
     The inputs ``first_level`` and ``first_print_um``, both of shape (size, size), are the layout of a first
-    print and its measured heights. The first print deviates differently from the prediction of each printer
-    model, and the next print is expected to deviate from this prediction as the first print did. ``printed``
-    therefore adds this deviation to the prediction, so search and scores compare the expected real print with
-    the target, as a measurement would.
+    print and its measured heights. The deviation of the first print from its prediction is computed for each
+    printer model. The next print is expected to have the same deviation, so ``printed`` adds it to the
+    prediction of the model. Search and scores then compare the expected real print with the target.
 
     Raises:
-        InputError: the start in the settings works only for holograms or lenses, or the spreads of the
-            process window lead outside the range in which the propagator is valid.
+        InputError: the start in the settings works only for holograms or lenses, or the propagator is not
+            valid for some draw of the process window.
     """
 
     name = "relief"
@@ -92,7 +93,8 @@ class ReliefTask(Task):
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         self._off: dict[Printer, Tensor] = {}
         for one in self.printers:
-            # The deviation is computed now, because the search may run its models at a lower precision.
+            # The deviation is computed here, before the search, because the models may run at a lower
+            # precision in the search.
             self._off_um(one)
         if "first_level" in self.inputs:
             self.notes.append(
@@ -110,12 +112,12 @@ class ReliefTask(Task):
             )
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return a bench that returns the print itself and ignores the light."""
+        """Return a bench that returns the heights of a print unchanged."""
         return _Bare(self.settings.layout).to(self.printer.device)
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Return the expected height of a real print, µm, shape (size, size). It is the print that the
-        printer predicts, plus the deviation of the first print, if any, from the prediction of this printer.
+        """Return the expected height of a real print, µm, shape (size, size). It is the prediction of the
+        printer. If there is a first print, its deviation from the prediction of this printer is added.
         """
         return super().printed(level, printer) + self._off_um(printer)
 
@@ -135,12 +137,12 @@ class ReliefTask(Task):
         return self._off[printer]
 
     def loss(self, seen: Tensor) -> Tensor:
-        """Return the rms error of a print after the mean error is removed, µm."""
+        """Return the rms error of a print, µm, after the mean error is subtracted."""
         return (seen - self.target).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the expected rms error of a real print, µm. It combines the error of the print that the
-        model predicts with the expected error of the model's prediction.
+        """Return the expected rms error of a real print, µm. Two errors are added in quadrature: the error of
+        the predicted print, and the expected error of the prediction.
         """
         rms_um = self.loss(seen)
         own_um = own_error_um(printer.card, float(self.target.std()))
@@ -164,40 +166,38 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors of a print, leaving out its offset. The zero of the heights is arbitrary, so the
+        """Return the errors of a print without ``offset_nm``. The zero of the heights is arbitrary, so the
         offset must not decide whether the print passes.
         """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the level of each cell from which the search starts: the candidate with the lowest expected
-        loss.
-
-        One candidate is the best affine layout. In the three others, each cell has the level whose wide
-        uniform field would have the target height; they place the relief at the bottom, in the middle and at
-        the top of the printable heights.
+        """Return the level of each cell from which the search starts. Of four candidates, the one with the
+        lowest expected loss is used. One candidate is the best affine layout. In the other three, the level
+        of each cell is chosen so that a wide uniform field of this level would have the target height. These
+        three place the relief at the bottom, in the middle and at the top of the printable heights.
         """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self._asked, zero) for zero in _AFFINE_ZEROS]
         return min((*starts, self.cells.average(self._best_affine)), key=self._expected)
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return two uncorrected layouts: the one whose nominal heights are the target heights, and the best
-        affine layout, whose levels are gain * height + zero.
+        """Return two uncorrected layouts: ``uncorrected``, whose nominal heights are the target heights, and
+        ``best affine``, whose levels are gain * height + zero.
         """
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the errors of the two uncorrected layouts, and the errors with the best levels that are not
-        rounded to integers.
-        """
+        """Return the errors of the two uncorrected layouts, and the errors of the best unrounded levels."""
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
 
     @property
     def _asked(self) -> Tensor:
-        """Return the height map, µm, that the model must predict so that the expected print is the target."""
+        """Return the height map, µm, that the model must predict if the expected print is to equal the
+        target.
+        """
         return self.target - self._off_um(self.printer)
 
     @property
@@ -211,8 +211,8 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Return the levels gain * height + zero, shape (size, size), with the gain and the zero that
-        minimise the loss over the printers.
+        """Return the levels gain * height + zero, shape (size, size). The gain and the zero minimise the loss
+        over the printers of the search.
         """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
@@ -237,8 +237,8 @@ class ReliefTask(Task):
 
     @torch.no_grad()
     def _expected(self, levels: Tensor) -> float:
-        """Return the loss of rounded levels over the printers of the search. ``levels`` contains one real
-        level per cell.
+        """Round ``levels``, one real level per cell. Return the loss of the result over the printers of the
+        search.
         """
         whole = self.cells(levels.round())[None, None].float()
         losses = torch.stack([self.loss_by(one, self.printed(whole, one))[0] for one in self.printers])
@@ -249,8 +249,8 @@ class ReliefTask(Task):
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Return the arrays that every task saves, and a map of the height error that remains even with the
-        best unrounded levels. No layout can remove this error.
+        """Return the arrays that every task saves, and a map of the height error of the best unrounded
+        levels. No layout can remove this error.
         """
         left = self.target - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
@@ -272,8 +272,8 @@ class ReliefTask(Task):
     def _levels_printing(
         self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5
     ) -> Tensor:
-        """Return one real level per cell. These levels print the heights of a relief if level k is printed
-        with the height ``level_heights_um[k]``.
+        """Return one real level per cell. The levels are chosen so that they would print the heights of a
+        relief if level k always had the printed height ``level_heights_um[k]``.
 
         ``zero`` is the position of the relief within the printable heights. At 0, the lowest point of the
         relief is printed with the lowest level; at 1, the highest point is printed with the highest level.

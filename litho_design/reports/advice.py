@@ -26,8 +26,8 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# The values that a summary states if a score contains them. Each entry consists of the key, the text, the
-# number of decimals and, where needed, a factor.
+# Scores that a summary states if they exist. Each entry consists of the key, the text, the number of decimals
+# and, where needed, a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
     ("strehl", "Strehl {}", 3),
@@ -41,8 +41,8 @@ _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("mae_calibrated", "MAE {} with the print's own PSF", 4),
 )
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
-# A warning is given if the thick element loses more than this share of the efficiency. Reflection alone
-# causes a loss of 4.6 %.
+# A warning is given if the efficiency as a thick element is lower by more than this share. Reflection alone
+# lowers it by 4.6 %.
 _THICK_SHARE = 0.1
 # If the lowest and the highest level together make up less than this share of the training pixels, the model
 # has hardly been trained on them.
@@ -85,7 +85,7 @@ def distribution_warning(design: Design) -> str:
 
 
 def width_sentence(design: Design) -> str:
-    """Return sentences about how much the predictions of all available models of the printer differ.
+    """Return sentences about the differences between the predictions of all available models of the printer.
 
     The text is empty if the model of the design is the only available model.
     """
@@ -111,7 +111,7 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
     """Return a sentence about one score: its value according to the first model, its median over all models,
     and its worst value.
 
-    If the models disagree by more than ``gain``, a second sentence says so.
+    If the models disagree by more than ``gain``, a second sentence states both values.
 
     Args:
         less: True if lower values are better.
@@ -140,8 +140,8 @@ def _parted(figure: str) -> tuple[str, str]:
 
 
 def thickness_warning(design: Design) -> str:
-    """Return a warning if the computed efficiency of the print is clearly lower when it is treated as a thick
-    element; otherwise, return an empty text.
+    """Return a warning if the efficiency of the print is clearly lower when it is computed as a thick
+    element. Otherwise, return an empty text.
     """
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
@@ -157,8 +157,8 @@ def thickness_warning(design: Design) -> str:
 
 
 def stroke_advice(design: Design) -> str:
-    """Return sentences about the stroke (height range) of the printed levels, and about the number of levels
-    or the level height at which the stroke becomes one wave.
+    """Return sentences about the stroke (height range) of the printed levels. They also state the number of
+    levels or the level height with which the stroke would be one wave.
     """
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (

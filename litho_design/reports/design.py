@@ -148,7 +148,7 @@ def _panels(
 
 
 def _add_scores(page: Page, design: Design, task: Task) -> None:
-    """Add the scores of a design and those of its baselines, which are computed on the same grid."""
+    """Add the scores of a design, and the scores of its baselines, which are computed on the same grid."""
     baselines = design.baselines or {}
     thick = {} if design.thick is None else {"print, thick element": design.thick}
     page.table(

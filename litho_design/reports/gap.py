@@ -99,9 +99,8 @@ def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """Return sentences that name the best arm (model to design with) according to each judge.
-
-    Judges that are also arms are skipped, unless there are no others.
+    """Return sentences that name the best arm (model used for design) according to each judge. If some judges
+    are not arms, only these judges are used.
     """
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = 1 if figure in registered_task(result.task).errors else -1
@@ -140,8 +139,8 @@ def _caption(task: str, figure: str) -> str:
 
 
 def _label(figure: str) -> str:
-    """Return the meaning of a score. The meaning of a score of a user-defined task is unknown, so its name is
-    returned.
+    """Return the meaning of a score, or its readable name if its meaning is unknown, as in a user-defined
+    task.
     """
     return _LABELS.get(figure) or named(figure)
 

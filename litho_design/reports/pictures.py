@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
     from litho_design.lenses.bench import LensBench
 
-# Highest intensity that the colour scale shows, relative to the white of the target; brighter speckle is
-# clipped.
+# Upper end of the colour scale, relative to the white of the target. Brighter speckle is clipped.
 BRIGHTEST = 1.5
 _GREY, _BLUE, _GREEN = "#9aa7b5", "#2f7fd0", "#3a9142"
 # Side, in inches, of a map with axes and a colour bar, and of a map without them.
@@ -24,8 +23,8 @@ _LARGE, _SMALL = 4.3, 2.4
 
 
 class Panel(NamedTuple):
-    """A map of shape (m, m) to draw. It is ``side_um`` wide, ``colours`` names its matplotlib colour map, and
-    it gets a colour bar if it has a unit.
+    """A map of shape (m, m) to draw, which is ``side_um`` wide. ``colours`` is the name of its matplotlib
+    colour map. If it has a unit, a colour bar is drawn.
     """
 
     title: str
@@ -56,7 +55,9 @@ def panels_figure(rows: Sequence[Sequence[Panel]]) -> Figure:
 
 
 def progress_figure(history: Sequence[Mapping[str, float]], design: Design) -> Figure:
-    """Draw the losses of the sampled layout and of the printable layout over the iterations of the search."""
+    """Draw two curves over the iterations of the search: the loss of the sampled layout, and the loss of the
+    printable layout.
+    """
     figure = new_figure(8, 3.4)
     axis = figure.subplots()
     for name, label, colour in (
@@ -111,13 +112,13 @@ def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Fig
 def yield_figure(
     draws: Sequence[Mapping[str, float]], figures: Mapping[str, tuple[float, str]], falling: Sequence[str]
 ) -> Figure:
-    """For each score, draw a curve of the share of randomly drawn prints that are at least as good as the
-    value on the horizontal axis.
+    """Draw one curve for each score. It shows the share of random prints whose score is at least as good as
+    the value on the horizontal axis.
 
     Args:
         draws: scores of each print, keyed by name.
-        figures: mapping from the name of each score to draw to a pair: its value for the print as modelled,
-            and its label.
+        figures: for each score to be drawn, its value for the print that the model predicts, and its label,
+            keyed by the name of the score.
         falling: names of the scores that are better when lower.
     """
     figure = new_figure(8, 3)

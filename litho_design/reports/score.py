@@ -88,8 +88,8 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """Return a sentence that compares the main score that was predicted in the design with the main scores
-    that the judging models predict.
+    """Return a sentence that compares the main score in the record of the design with the main scores that
+    the judging models predict.
 
     The sentence is empty if fewer than two models judge.
     """

@@ -19,8 +19,8 @@ def meanings(score: type[Record]) -> dict[str, str]:
 def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Return a table with one row per score. Each row contains the meaning of the score, and its value for
-    each print and baseline.
+    """Return a table with one row per score. Each row contains the meaning of the score, and the value of the
+    score for each print and baseline.
     """
     # A user-defined task need not describe its scores.
     names = dict.fromkeys(

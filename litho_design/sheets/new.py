@@ -27,11 +27,11 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.first import small_hologram
 
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
-# Cut-off frequencies of the random layouts, in cycles per µm; successive layouts use them in turn. The
-# layouts of the published measured prints have the same cut-off frequencies.
+# Cut-off frequencies, in cycles per µm, which successive random layouts use in turn. The layouts of the
+# published measured prints have the same cut-off frequencies.
 _CUTOFFS_PER_UM = (0.25, 0.5)
 # Number of steps of the staircase pattern. The pattern covers only three fifths of a side, and the printer
-# rounds the edges of the steps, so few, wide steps are used.
+# rounds the edges of the steps. Few steps are therefore used, so that they are wide.
 _TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate without a print, which shows the zero, tilt and bow of the microscope",
@@ -61,8 +61,8 @@ def new_sheet(
 
     Args:
         out: folder of the sheet; an interrupted run in it resumes.
-        model: model through which one version of the hologram is designed; the other is designed without a
-            model.
+        model: model with which one version of the hologram is designed. The other version is designed without
+            a model.
         format: format of the files for the printer, as for ``export``.
         target: target image of the hologram.
         settings: settings of both versions of the hologram, by default those of ``small_hologram``. All

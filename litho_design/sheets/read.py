@@ -1,5 +1,5 @@
-"""Evaluate the scans of a sheet: build a dataset, fit a printer model, correct it, freeze it together with
-its model card, and compare the two printed holograms.
+"""Evaluate the scans of a sheet: build a dataset, fit a printer model, correct the model, freeze it together
+with its card, and compare the two printed holograms.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ from litho_data.foundation.run_facts import RunFacts
 from litho_data.store.schema import DatasetId
 
 Arm = Literal["without", "with"]
-# Names of the two designs of the hologram: the one without a model (for a perfect printer), and the one with
-# the model.
+# Names of the two designs of the hologram. The first is made without a model (for a perfect printer), the
+# second with the model.
 ARMS: tuple[Arm, ...] = ("without", "with")
 HOLOGRAM, SCANS_OF_HOLOGRAMS = "hologram", "hologram-scans"
 
