@@ -196,8 +196,8 @@ class Process(Record):
 
 class Ids(Record):
     """The ``[ids]`` table: what the ids of the scans mean. ``print`` is a regular expression that matches a
-    whole id. The text that its group named ``print`` captures is the name of the print to which the scan
-    belongs. ``table`` is a CSV file with further facts about each scan.
+    whole id. Its group ``print`` captures the name of the print to which the scan belongs. ``table`` is a CSV
+    file with further facts about each scan.
     """
 
     print: Annotated[str, AfterValidator(_id_pattern)] | None = None

@@ -76,7 +76,9 @@ HelpAll = Annotated[
 
 
 def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
-    """Give a function that takes ``**values`` the signature that typer should see, made of ``parameters``."""
+    """Return ``run``, which takes ``**values``, with a signature made of ``parameters``. Typer reads this
+    signature.
+    """
     # Typer reads the signature and the annotations.
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
@@ -103,8 +105,8 @@ def takes_more(
 
 
 def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the option ``--help-all``, which also shows hidden options, to a command that hides some of its
-    options.
+    """Add the option ``--help-all`` to a command. It shows all options, including those that the command
+    hides.
     """
 
     @functools.wraps(command)

@@ -68,7 +68,7 @@ def import_pairs(
         out: path of the store.
         pitch_um, level_height_um, levels: pixel pitch and nominal height of a level, in µm, and number of
             levels. The files do not state these values; the defaults are those of the paper.
-        name: name of the dataset; by default that of the folder.
+        name: name of the dataset; by default the name of the folder.
         workers, dask: as for ``build_dataset``.
         strict: if true, nothing is built if any field cannot be used; if false, such fields are skipped.
 

@@ -96,8 +96,7 @@ def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
 
 def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
     """Return the folder of a store's raw files. If ``data_dir`` is None, the folder that the build recorded
-    and the known folders of the dataset are tried; the result is None if none of them contains any of the
-    files.
+    and the known folders of the dataset are tried. If these folders contain no raw file, the result is None.
 
     Raises:
         InputError: ``data_dir`` is given but is not a folder.

@@ -50,8 +50,8 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
     Args:
         store_path: a ``.zarr`` folder or ``.zarr.zip`` file.
         data_dir: folder of the raw files. By default, the folder that the build recorded (relative to the
-            store), ``$LITHO_DATA_DIR/<name>`` and the user cache are tried. If none of them contains the
-            files, a note says so.
+            store), ``$LITHO_DATA_DIR/<name>`` and the user cache are tried. If no folder contains the files,
+            ``notes`` states this.
 
     Raises:
         InputError: there is no store at the path, or ``data_dir`` does not exist.
@@ -119,8 +119,8 @@ def _documents(path: Path) -> Iterator[Finding]:
 
 
 def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
-    """Yield what a check yields. If the check ends because it cannot read its data, yield one more finding
-    that says so.
+    """Yield what a check yields. If the check ends because its data cannot be read, yield one more finding,
+    which states this.
     """
     try:
         with damaged("data that a check needs"):

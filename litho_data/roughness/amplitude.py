@@ -18,7 +18,7 @@ class AmplitudeParameters(Record):
         sq_nm: root mean square of the deviations, nm.
         ssk: skewness; 0 for a flat surface.
         sku: kurtosis; 3 for a Gaussian surface, 0 for a flat surface.
-        sz_nm: height of the highest pixel minus that of the lowest, nm.
+        sz_nm: height of the highest pixel minus height of the lowest pixel, nm.
         pixels: number of pixels used.
     """
 
@@ -88,7 +88,7 @@ def autocorrelation(height_um: Array) -> Array:
 
 
 def _pairs(shape: Shape, rows: Array, columns: Array) -> Array:
-    """Return how many pixel pairs have each lag, an array of shape (rows, columns)."""
+    """Return the number of pixel pairs with each lag, shape (rows, columns)."""
     return np.outer(shape[0] - rows, shape[1] - np.abs(columns))
 
 
@@ -109,7 +109,7 @@ def effective_samples(height_um: Array) -> float:
     columns = np.arange(-reach, reach + 1)
 
     def total(values: Array) -> float:
-        """Sum over all lags. Values at negative row lags mirror those at positive ones."""
+        """Sum over all lags. Positive row lags count twice, because opposite lags have equal values."""
         return float(2 * np.sum(values) - np.sum(values[0]))
 
     noise = 1 / _pairs(height_um.shape, rows, columns)

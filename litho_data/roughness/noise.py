@@ -22,8 +22,8 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
 
     A printer writes nothing finer than its spot, so differences of high order between neighbouring pixels
     contain only noise. Differences along both axes give the pixel noise. Differences of the line means along
-    the slow axis give the line noise. Drift (noise that is correlated between lines) and noise that the
-    microscope's feedback has smoothed look like printed structures, so the estimates do not include them.
+    the slow axis give the line noise. The estimates do not include drift (noise that is correlated between
+    lines) or noise that the microscope's feedback has smoothed, because both look like printed structures.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.

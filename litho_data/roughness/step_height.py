@@ -153,12 +153,12 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
     """Find the edges of a step, ridge, groove or row of grooves in a scan, and return the mean height of the
     steps at these edges.
 
-    The slope of the field is removed from the median profile. An edge is a place where the change of this
-    profile is at least half as large as its largest change. The heights of the steps are fitted as in
-    ``stair_steps``, and their absolute values are averaged. A raw scan shows the bow of the scanner, so a
-    curvature common to all treads is fitted too. Steps of one scan share treads, so their errors are not
-    independent. The stated uncertainty is therefore the uncertainty of a single step; it is not divided by
-    the root of the number of steps.
+    The slope of the field is removed from the median profile. An edge is a place where this profile changes
+    by at least half of its largest change. The heights of the steps are fitted as in ``stair_steps``, and
+    their absolute values are averaged. A raw scan shows the bow of the scanner, so a curvature common to all
+    treads is fitted too. Steps of one scan share treads, so their errors are not independent. The stated
+    uncertainty is therefore the uncertainty of a single step; it is not divided by the root of the number of
+    steps.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.

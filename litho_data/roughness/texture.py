@@ -66,11 +66,11 @@ class LinePeriod:
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """Find the direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) contributes a vector whose length is the power at this frequency and whose angle
-    is twice that of (fx, fy), so that opposite directions count as the same. Each surface is divided by its
-    own variance. The powers P of a random surface are independent and exponentially distributed. For an
-    isotropic surface, the mean vector is therefore normally distributed with variance 1 / n, where n = (Σ P)²
-    / Σ P² is the effective number of frequencies.
+    Each frequency (fx, fy) contributes a vector. The length of this vector is the power at this frequency,
+    and its angle is twice the angle of (fx, fy), so that opposite directions count as the same. Each surface
+    is divided by its own variance. The powers P of a random surface are independent and exponentially
+    distributed. For an isotropic surface, the mean vector is therefore normally distributed with variance 1 /
+    n, where n = (Σ P)² / Σ P² is the effective number of frequencies.
 
     Args:
         heights_um: levelled heights in µm, one array of shape (ny, nx) per surface. The pixels must be

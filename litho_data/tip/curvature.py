@@ -32,8 +32,8 @@ def noise_of(height_um: Array) -> Noise:
     """Estimate the noise of a scan from fourth differences of its heights. ``height_um`` has shape (ny, nx).
 
     The fourth differences of a parabola are zero, so the parabolas that a tip leaves in the image do not
-    affect them. If the differences along the columns are larger than those along the rows, the excess is
-    attributed to offsets of whole rows, and vice versa.
+    affect the estimate. If the differences along the columns are larger than the differences along the rows,
+    the excess is attributed to offsets of whole rows, and vice versa.
     """
     rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)

@@ -45,8 +45,8 @@ class TipEstimate(RunFacts, Result):
         reason: why the radius is only a bound; empty if it is an estimate.
         depth_um: range of heights, after removal of tilt and bow, in the scan from which the radius was
             determined.
-        reach_px: radius, in pixels, of the image that the tip produces of a spike as high as ``depth_um``; it
-            is √(2 R depth_um) for the tip radius R.
+        reach_px: radius, in pixels, that a spike with the height ``depth_um`` has in the image. For the tip
+            radius R, it corresponds to √(2 R depth_um).
         pixel_noise_nm, line_noise_nm: standard deviations of the noise of single pixels and of whole lines,
             averaged over the scans as a root mean square.
         window_px: side length of the windows in which curvatures were measured; None if there is no bound.

@@ -127,8 +127,8 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
 @dataclass(frozen=True)
 class _Tops:
     """Curvatures of a scan, measured in windows of one size, in 1/µm. They are positive at peaks, and NaN
-    where a window contains an unmeasured pixel. ``edge`` is the upper edge of their distribution, and
-    ``noise`` is their standard deviation due to noise.
+    where a window contains an unmeasured pixel. ``edge`` is the upper edge of the distribution of the
+    curvatures, and ``noise`` is the standard deviation that noise causes in them.
     """
 
     half_px: int
@@ -219,7 +219,8 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
 
 def _edge(curvatures: Array, noise: float) -> float:
-    """Return the upper edge of a distribution of curvatures, after subtracting what noise adds to it.
+    """Return the upper edge of a distribution of curvatures, minus the amount by which noise raises this
+    edge.
 
     A result of 0 or less means that the curvatures are nothing but noise.
     """
