@@ -34,11 +34,11 @@ def hologram_baselines(
     of the baseline.
 
     ``diffraction-limited`` is an element whose amplitude and phase may take any values on each pixel. Its
-    wave is found by forty Gerchberg-Saxton steps towards an image with a flat phase. ``continuous phase`` has
-    one arbitrary phase per cell, without a printer and levels. These phases are found by a hundred descent
-    steps on the loss of the design, which start from the result of the Gerchberg-Saxton algorithm. The lowest
-    loss is one of the scores. ``weighted GS`` also has one phase per cell, found by forty weighted
-    Gerchberg-Saxton steps.
+    wave is found by forty Gerchberg-Saxton steps, which start from an image with a flat phase. ``continuous
+    phase`` has one arbitrary phase per cell, without a printer and levels. These phases are found by a
+    hundred descent steps on the loss of the design, which start from the result of the Gerchberg-Saxton
+    algorithm. The lowest loss is one of the scores. ``weighted GS`` also has one phase per cell, found by
+    forty weighted Gerchberg-Saxton steps.
     """
     parts = settings.layout, settings.optics, settings.loss
     pixels = array_sha256(target.cpu().numpy(), "1", ("y", "x"))
@@ -100,8 +100,8 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
 
 @torch.no_grad()
 def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
-    """Return a wave of unit power whose image is close to the amplitude sqrt(target), starting from a flat
-    phase of the image. The wave has shape (size, size).
+    """Return a wave of unit power whose image has approximately the amplitude sqrt(target). The search for
+    this wave starts from an image with a flat phase. The wave has shape (size, size).
     """
     wanted = target.sqrt()
     area = math.prod(bench.grid.pitch_um)
