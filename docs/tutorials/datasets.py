@@ -1,7 +1,7 @@
 # %% [markdown]
 # # From scans to a dataset
 #
-# You have AFM scans of prints and the layouts that were printed. By the end of this page, you have one
+# You have AFM scans of some prints, and the layouts of these prints. By the end of this page, you have one
 # dataset. In it, every scan is aligned to its layout pixel by pixel, and the origin of every number is
 # recorded. Here the scans come from the built-in virtual fab. For [your own scans](../own_data.md), only the
 # first step differs.
@@ -13,9 +13,9 @@ card = litho_data.simulate("campaign", count=6, size_px=160, seed=3)
 print(card)
 
 # %% [markdown]
-# `card.toml` states which files are scans and which layout belongs to each. It also states what the files
-# do not: pitch, level height, units. The scans are raw: tilted, bowed, slightly rotated, and with an
-# unknown zero. Read one:
+# `card.toml` states which files are scans and which layout belongs to each scan. It also states the pitch, the
+# level height and the units, because the files do not. The scans are raw: tilted, bowed, slightly rotated, and
+# with an unknown zero. Read one scan:
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -23,7 +23,7 @@ low, high = scan.height_um.min(), scan.height_um.max()
 print(f"{scan.name}: {scan.height_um.shape} pixels, heights {low:.2f} … {high:.2f} µm")
 
 # %% [markdown]
-# One call reads all scans, registers each to its layout and stores the result with its history. If the card
+# One call reads all scans, registers each scan to its layout and stores the result with its history. If the card
 # names a levelling recipe, the recipe is applied too.
 
 # %%
@@ -32,8 +32,8 @@ print(result.n_scans, "scans stored,", len(result.skipped), "skipped")
 
 # %% [markdown]
 # The quality table shows how well each scan fits its layout. `ncc_after` is the correlation of height and
-# layout after registration. `tre_median_nm` is the median distance between matching details of scan and
-# layout that the fit did not use ([good values](../registration.md)).
+# layout after registration. `tre_median_nm` is the median distance between details of the scan and the same
+# details of the layout, in blocks that the fit did not use ([good values](../registration.md)).
 
 # %%
 store = litho_data.open_store("prints.zarr")

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Twelve pictures, ten lines each
 #
-# The code above each picture draws it. Run all the code once, from top to bottom. The first cell simulates
+# Each picture is drawn by the code above it. Run all the code once, from top to bottom. The first cell simulates
 # four prints and defines a function that shows maps. All maps are about 16 µm wide. For real prints, see
 # [your own scans](../own_data.md).
 
@@ -117,7 +117,7 @@ missed = {name: first.height_um - own for name, own in prints.items()}
 show({name: 1e3 * (one - np.nanmedian(one)) for name, one in missed.items()}, "RdBu_r", vmin=-150, vmax=150)
 
 # %% [markdown]
-# ## 9. What could be the cause: changes by single [knobs of the virtual fab](../virtual_fab.md), in nm
+# ## 9. What could be the cause: the change by each [knob of the virtual fab](../virtual_fab.md), in nm
 
 # %%
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job
@@ -167,7 +167,3 @@ from matplotlib.image import imread
 file = litho_design.export("hologram", "png16", "files")
 levels, sidecar = litho_design.import_levels(file)
 show({f"{file.name}: grey": imread(file), "levels read back": levels})
-
-# %% [markdown]
-# Next: [from scans to a dataset](datasets.md), [which model predicts best?](models.md), [a hologram through the
-# printer](optics.md).

@@ -2,8 +2,8 @@
 # # Which model predicts best?
 #
 # You want to know which model of the printer predicts best, and by how much. On this page you compare three
-# models on scans that none of them was trained on. You get confidence intervals, and see how much of each
-# error is noise.
+# models on scans on which none of the models was trained. You get confidence intervals, and see how much of
+# each error is noise.
 
 # %%
 import litho_data
@@ -13,7 +13,7 @@ card = litho_data.simulate("campaign", count=8, size_px=128, seed=0)
 built = litho_data.build_dataset(card, "prints.zarr")
 
 # %% [markdown]
-# `benchmark` divides the scans, except the locked ones, into folds. Each fold is predicted by models trained
+# `benchmark` divides the scans, except the locked scans, into folds. Each fold is predicted by models trained
 # on the other folds. The error is the mean absolute difference between measured and predicted height after
 # the unknown zero of each scan is removed ([why](../evaluation.md#two-errors)).
 
@@ -52,8 +52,8 @@ from litho_models.evaluation.plots import error_bars
 error_bars(result.scores, floor.mae_at("offset"), paper_line=False)
 
 # %% [markdown]
-# Train the model that you chose on all scans except the locked ones, and freeze it. The result is a folder
-# with weights and a card, to use in designs or to share.
+# Train the model that you chose on all scans except the locked scans, and freeze it. The result is a folder
+# with weights and a card, which you can use in designs or share.
 
 # %%
 litho_models.train("prints.zarr", "physics", "run")

@@ -16,9 +16,9 @@ designs = {
 }
 
 # %% [markdown]
-# `without` was designed for a perfect printer, and `with` through a model trained on measured prints. How
-# good a design looks to its own model proves nothing. Let a model that was used for neither design predict
-# both prints, and score their images:
+# `without` was designed for a perfect printer, and `with` through a model trained on measured prints. A good
+# score from its own model proves nothing about a design. So another model, used for neither design, predicts
+# both prints, and their images are scored:
 
 # %%
 judged = {
@@ -47,9 +47,9 @@ for axes, (title, image) in zip(figure.subplots(1, 3), images.items(), strict=Tr
 figure
 
 # %% [markdown]
-# Both images are predictions. What counts is a measurement: `litho_design.score` accepts a photograph of
-# the image or an AFM scan of the print in place of the model. To print the element, export the layout as an
-# image of levels. A second file, the sidecar, states heights and size, so that the image can be read back.
+# Both images are predictions. Only a measurement proves a design, so `litho_design.score` also accepts a
+# photograph of the image or an AFM scan of the print. To print the element, export the layout as an image of
+# levels. A second file, the sidecar, states heights and size, so that the image can be read back.
 
 # %%
 print(litho_design.export("with", "png16", "to-printer").name)
