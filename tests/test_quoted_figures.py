@@ -66,7 +66,8 @@ def uncertainties(record: dict[str, Any]) -> list[str]:
     return [
         f"deviation of {min(ratios):.2f} to {max(ratios):.2f}",
         f"{min(shares):.0f} to {max(shares):.0f} % of the pixels lie within 1 σ",
-        f"it is {worst['sd']:.2f}, and a single scan was off by {max(worst['sd_of_scans']):.1f} σ",
+        f"this deviation is {worst['sd']:.2f}, and a single scan was off by "
+        f"{max(worst['sd_of_scans']):.1f} σ",
     ]
 
 
@@ -76,8 +77,8 @@ def readers(record: dict[str, Any]) -> list[str]:
     slowest = max(one["longest_s"] for one in bodies)
     return [
         f"Of {len(files)} files from other programs {sum(not one['refused'] for one in files)} were read",
-        f"50,000 random bodies behind {len(bodies)} signatures were all refused; the slowest took "
-        f"{slowest:.1f} s",
+        f"50,000 files of random bytes after one of {len(bodies)} signatures were all refused; "
+        f"the slowest took {slowest:.1f} s",
     ]
 
 
