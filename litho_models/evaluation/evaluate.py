@@ -1,10 +1,11 @@
 """Evaluate one frozen model on a dataset, and write ``evaluation.json`` and a report."""
 
 from pathlib import Path
+from typing import Literal
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
@@ -18,7 +19,7 @@ from litho_models.frozen.on_store import (
     predict_frozen,
     trained_ids,
 )
-from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
+from litho_models.scan_terms import NuisanceProtocol, Policy
 from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import stated_floor
 from litho_models.scoring.records import Prediction
@@ -32,7 +33,7 @@ def evaluate(
     out: str | Path,
     *,
     policy: Policy | None = None,
-    background: BackgroundUse | None = None,
+    background: Literal["training", "none"] | None = None,
     noise: str | Path | None = None,
     extrapolate: bool = False,
     open_lock_box: bool = False,
@@ -60,11 +61,12 @@ def evaluate(
 
     Raises:
         InputError: the model or the store cannot be read, their pitch or level height differs, no scan is
-            left to score, or the noise analysis belongs to other data.
+            left to score, the noise analysis belongs to other data, or the background is not a known one.
     """
     dataset = open_store(store)
     film = dataset.instrument == "sem"
-    policy, background = policy or usual_policy(film), background or usual_background(film)
+    policy, added = policy or usual_policy(film), background or usual_background(film)
+    require_known("background", added, ("training", "none"))
     floor = stated_floor(dataset.name, noise)
     frozen = load_frozen(model, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
@@ -77,7 +79,7 @@ def evaluate(
         if not scans:
             raise InputError(f"scans of {store} to score", got="none", wanted="at least one")
         ids = [scan.id for scan in scans]
-        learned = card_background(frozen, scans) if background == "training" else None
+        learned = card_background(frozen, scans) if added == "training" else None
         predictions = [
             Prediction.beside(learned, scan, predict_frozen(frozen, scan))
             for scan in progress(scans, "predicting")

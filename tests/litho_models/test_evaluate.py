@@ -65,6 +65,13 @@ def test_no_more_than_the_error_can_be_removed(trained, tmp_path, share):
     assert " -" not in text
 
 
+def test_a_background_that_is_not_in_the_card_is_refused(trained, tmp_path):
+    store, _, folder = trained
+    with pytest.raises(InputError, match="background, got 'shared', wanted training, none"):
+        evaluate(folder / "model", store, tmp_path / "out", background="shared")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path):
     store, _, folder = trained
     with pytest.raises(InputError, match=f"use {folder}/model$") as caught:
