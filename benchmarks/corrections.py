@@ -162,10 +162,10 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     named = f" ({', '.join(listed)})" if listed else ""
     median = np.median([over_idle(row) for row in rows])
     return (
-        f"Of {len(rows)} corrections, {len(worse)} print more than 5 % worse than nominal heights or the "
-        f"best affine layout, whichever is better{named}. The median error of a correction is "
-        f"{median:.2f} × that of the better of these two layouts; for a blaze, it is "
-        f"{np.median(blazes):.2f} × that of the best affine layout. "
+        "Each correction is compared with the layout of nominal heights or the best affine layout, whichever "
+        f"is better. Of {len(rows)} corrections, {len(worse)} have a print error more than 5 % larger{named}."
+        f" The median ratio of the errors is {median:.2f}. For a blaze, the ratio to the error of the best "
+        f"affine layout is {np.median(blazes):.2f}. "
         f"The errors of {len(inside)} of {len(rows)} prints lie in the range that the correction stated."
     )
 

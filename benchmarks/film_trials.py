@@ -123,7 +123,7 @@ def text_of(record: Mapping[str, Any]) -> str:
             table.append((process, planted, *counts, "{:.2f} → {:.2f} nm".format(*edges)))
     heads = (
         "process",
-        "planted cause",
+        "hidden cause",
         "trials answered correctly",
         "trials in which a law was added",
         "edge error on held-out films, before → after the loop",

@@ -73,8 +73,8 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error on {len(split['scored_ids'])} held-out scans ({split['folds']} folds of scans, "
         f"seed {split['seed']}; {_steps_text(benchmark)}). Brackets contain 95 % intervals from "
         f"resampling scans. The {len(split['lock_box'])} locked scans belong to no fold and affect no number "
-        "here. The k terms of each scan are fitted to pixels that are not scored. Levelling leaves in all "
-        "maps the same smooth background, whose five coefficients are fitted to the training scans. It is "
+        "here. The k terms of each scan are fitted to pixels that are not scored. After levelling, all maps "
+        "contain the same smooth background. Its five coefficients are fitted to the training scans. It is "
         "added to predictions of measured maps, but not to designs. The noise is an upper estimate "
         "([how](../../noise.md)), and its intervals come from resampling prints. A better model can remove "
         "at least the part of an error that exceeds the noise. For each model, this part at k = 1 and at "
@@ -103,10 +103,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         ("model", "parameters", "offset fitted (k = 1)", "offset, gain, tilt and bow fitted (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds. Each scan is predicted by a model not trained on it, plus the smooth background of that "
-        "model's training scans. Then k terms are fitted to each scan, on pixels that are not scored. "
-        "Brackets: 95 % intervals from resampling scans; in the row of what the layout cannot explain, "
-        "from resampling the 6 prints. This row includes errors common to a place, field or print.",
+        "folds. A scan is predicted by a model not trained on it; the smooth background of the model's "
+        "training scans is added. Then k terms are fitted to each scan, on pixels that are not scored. "
+        "Brackets contain 95 % intervals from resampling scans or, for what the layout cannot explain, the 6 "
+        "prints. This value includes errors common to a place, field or print.",
     )
 
 

@@ -247,12 +247,11 @@ def summary(trials: list[dict[str, Any]]) -> str:
             "declared not separable",
         ),
         rows,
-        f"Each of the {len(trials)} trials plants one knob. In {with_question} of them, the first round left "
-        "a question about the planted cause. The predicted power is the probability, according to the plan, "
-        f"that {PRINTS} prints decide a question. Brackets contain 95 % Wilson intervals of the share. For "
-        "the questions in the last column, the plan stated before printing that no experiment separates the "
-        "answers.",
-        "With the optimised layouts, the questions about each planted knob were decided correctly in this "
+        f"In {with_question} of the {len(trials)} trials, the first round left a question about the hidden "
+        f"cause. The predicted power is that of {PRINTS} prints. Brackets contain 95 % Wilson intervals of "
+        "the share. For the questions in the last column, the plan stated before printing that no experiment "
+        "separates the answers.",
+        "With the optimised layouts, the questions about each hidden cause were decided correctly in this "
         f"many trials: {_by_knob(trials)}.",
     )
 

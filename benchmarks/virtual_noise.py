@@ -66,8 +66,8 @@ def dose_table(found: NoiseAnalysis) -> str:
             "readability of the worst step",
         ),
         rows,
-        f"Recommended dose: {found.dose.recommended_dose:g}. Reason: {found.dose.reason}. These scans were "
-        f"left out of the other estimates: {', '.join(found.run.dropped)}.",
+        f"Recommended dose: {found.dose.recommended_dose:g}. Reason: {found.dose.reason}. Scans left out of "
+        f"the other estimates, with the reason: {', '.join(found.run.dropped)}.",
     )
 
 

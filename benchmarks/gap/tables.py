@@ -41,9 +41,9 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     parts = [
         f"Strengths of the fab's effects (10 nm rms each): {knobs}. The models were trained on "
         f"{record['training_scans']} of {effort['scans']} scans of its prints, each {effort['scan_px']} px "
-        f"wide; the networks for {effort['training_steps']:,} steps. "
+        f"wide. The networks were trained for {effort['training_steps']:,} steps. "
         f"{_precision_text(effort['search_precision'])} In the tables of designs, a cell contains the score "
-        "that the design predicted for itself, an arrow, and the score after printing, with ± half its 95 % "
+        "predicted by the model of the design, an arrow, the score after printing, and ± half of its 95 % "
         "interval (Student's t) over seeds.\n\n" + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
@@ -51,16 +51,16 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
-        f"The searches for all {designs} designs took {minutes / 60:.1f} hours in total. Each ran in one "
-        "thread on a computer that did other work at the same time."
+        f"The searches for all {designs} designs took {minutes / 60:.1f} hours in total, each in one thread "
+        "of a busy computer."
     )
     return "\n\n".join(parts)
 
 
 def _precision_text(search: str) -> str:
     if search == "float32":
-        return "Searches, prints and scores ran in float32."
-    return f"Searches ran in {search}, prints and scores in float32."
+        return "The searches, the prints and the scores were computed in float32."
+    return f"The searches were computed in {search}, the prints and the scores in float32."
 
 
 def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
@@ -159,13 +159,12 @@ def lead_text(
         low, high = sorted(turn * end for end in item["ci95"])
         open_ = "" if low * high > 0 else ", which includes 0"
         interval = f"({low:.{digits}f} to {high:.{digits}f}{open_})"
-        designs = "designs without a model" if other == "none" else f"designs with {other}"
+        designs = "designs without a model" if other == "none" else other
         against.append(f"{turn * item['mean']:.{digits}f} {interval} over {designs}")
     name, _, unit = LABELS[figure].removesuffix(")").partition(" (")
     return (
-        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. Their lead in "
-        f"this score{f', in {unit}' if unit else ''}, with its 95 % interval in brackets, is "
-        f"{'; '.join(against)}."
+        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. Their "
+        f"lead{f' in {unit}' if unit else ''}, with its 95 % interval, is {'; '.join(against)}."
     )
 
 

@@ -85,7 +85,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
         one.verdict == "clean" for trial in trials if trial.draw.kind == "empty" for one in trial.outcomes
     ]
     figures += [
-        Figure("nothing planted: nothing reported", share(empty), "all"),
+        Figure("nothing hidden: nothing reported", share(empty), "all"),
         Figure("trials that failed", str(sum(bool(trial.failure) for trial in trials)), "0"),
     ]
     bias = np.array([trial.bias for trial in trials if trial.bias and trial.draw.causes])

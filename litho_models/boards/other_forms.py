@@ -133,7 +133,9 @@ def _far_copy(rng: Rng) -> Law:
 
 @_form("oriented-ringing", "dose", "1", 2.0)
 def _oriented_ringing(rng: Rng) -> Law:
-    """Relative gain of the dose at one period (2–5 µm) along one direction; the ringing fades over 2–5 µm."""
+    """Relative increase of the dose at one period (2–5 µm) along one direction; the ringing fades over
+    2–5 µm.
+    """
     period_um, decay_um, direction = rng.uniform(2, 5), rng.uniform(2, 5), rng.uniform(0, np.pi)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -185,7 +187,7 @@ def _fast_axis_memory(rng: Rng) -> Law:
 
 @_form("crowding", "dose", "1", 4.0)
 def _crowding(rng: Rng) -> Law:
-    """Relative gain of the dose per cube of the dose averaged over 2.5–5 µm."""
+    """Relative increase of the dose per cube of the dose averaged over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
         dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
@@ -266,7 +268,7 @@ def _fringes(rng: Rng) -> Law:
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: Rng) -> Law:
-    """Gain of detail that is finer than 0.6–1.2 µm, so that edges overshoot."""
+    """Amplification of detail finer than 0.6–1.2 µm, so that edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
         surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
@@ -333,7 +335,7 @@ def _seam_in_place(rng: Rng) -> Law:
 
 @_form("rim", "surface", "1", 1.0)
 def _rim(rng: Rng) -> Law:
-    """Relative gain of the height at the edge of the layout; the gain fades over 1.5–3 µm."""
+    """Relative increase of the height at the edge of the layout; it fades over 1.5–3 µm."""
     reach_um = rng.uniform(1.5, 3)
 
     def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
