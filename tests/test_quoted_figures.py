@@ -136,7 +136,7 @@ def quadrants(record: dict[str, Any]) -> list[str]:
         f"this bound averages {affine['datum_size']['mean_nm']:.0f} nm",
         f"{prints[:4].mean():.0f} nm too high in the four prints",
         f"{-prints[4:].mean():.0f} nm too low in the two",
-        f"the bound is {seven['datum_size']['mean_nm']:.0f} nm on prints outside the fit, and the error is "
+        f"the bound is {seven['datum_size']['mean_nm']:.0f} nm and the mean absolute error "
         f"{seven['mae']['mean_nm']:.0f} nm",
     ]
 

@@ -2,8 +2,8 @@
 to the print.
 
 Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
-The topography does not explain some effects in the heights. The spread of the fits includes the errors that
-these effects cause, if the effects differ from block to block.
+The layout does not explain everything in the heights. If what it leaves unexplained differs from block to
+block, the spread of the fits includes the errors that this causes.
 """
 
 from dataclasses import dataclass

@@ -372,8 +372,8 @@ def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
     """Displace a print of shape (ny, nx) by an affine map. ``corner_px``, shape (2, 3), contains for each
     axis a shift and two linear terms. If these numbers are random with the standard deviation s, the corners
     move by s px (rms) along each axis. The three terms are weighted like the errors of an affine map that is
-    fitted to points spread evenly over a square. There, the shift and the displacements of an edge by the two
-    linear terms have variances in the ratio 1 : 3 : 3.
+    fitted to points spread evenly over a square. Such a fit displaces
+    the edges of the square by a shift and by two linear terms, whose variances are in the ratio 1 : 3 : 3.
     """
     from scipy.ndimage import affine_transform
 

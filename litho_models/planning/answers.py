@@ -59,8 +59,8 @@ def of_repeats(prints: int, scans: int) -> float:
 
     The test is the F test of an analysis of variance. The term is attributed to the printer if the scans of
     one print agree better than expected by chance (p <= 0.005). It is attributed to the microscope if these
-    scans agree less well than expected for an effect of the printer (p <= 0.005). The two tests have
-    different powers, and the smaller power is returned.
+    scans agree less well than expected for an effect of the printer (p <= 0.005). The two
+    attributions have different powers, and the smaller power is returned.
     """
     if prints < 2 or scans < 2:
         return 0.0

@@ -113,8 +113,8 @@ def smooth_training_terms(policy: Policy) -> Terms:
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
-    """For each scan, estimate the terms that the scan adds to the height predicted by a model, from all its
-    valid pixels. Return the sum of the terms, µm, as a float32 map of shape (ny, nx) for each scan. The means
+    """From all valid pixels of each scan, estimate the terms that the scan adds to the height that a model
+    predicts. Return the sum of the terms, µm, as a float32 map of shape (ny, nx) for each scan. The means
     of offset and gain over all scans are not part of this sum, because they are attributed to the process.
 
     Use these maps only for training. For errors that are reported, use ``cross_fit``, which fits the terms to
