@@ -3,8 +3,7 @@
 To process one scan, call ``read_scan``, ``level_scan``, ``register_scan`` and ``resample_to_layout`` in this
 order. To build a whole dataset, call ``build_dataset`` with a dataset card (the TOML file that describes the
 raw files), and read the result with ``open_store``. ``fetch`` downloads the files of a known dataset.
-``simulate`` writes such raw files for simulated prints, as a virtual printer and microscope would deliver
-them.
+``simulate`` writes the raw files that a virtual printer and a virtual microscope would deliver.
 """
 
 from typing import TYPE_CHECKING

@@ -1,3 +1,3 @@
-"""Dataset cards: TOML files that describe the raw files of a dataset, where they are, and the printed fields
-that they show.
+"""Dataset cards: TOML files that describe a dataset: its raw files, where to find them, and the printed
+fields that they show.
 """

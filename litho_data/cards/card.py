@@ -151,8 +151,8 @@ class ScanFiles(Record):
     y and x, for file formats that do not state it.
 
     ``instrument`` is the kind of instrument. A ``confocal`` microscope has no tip. The files of a scanning
-    electron microscope (``sem``) are pictures of a film of uniform height, the full height of the layout; the
-    build measures where the edges of this film lie.
+    electron microscope (``sem``) are pictures of a film. The film has the full height of the layout
+    everywhere, and the build measures where its edges lie.
 
     If ``levelled`` is true, the build uses the heights in the files without levelling them. ``missing`` lists
     the numbers and words that stand for unmeasured pixels in the files; an empty list says that no value has
@@ -181,8 +181,8 @@ class ScanFiles(Record):
 
 
 class Process(Record):
-    """The ``[process]`` table: how raw scans are processed. It names a file with a levelling recipe, the
-    registration model and the tip.
+    """The ``[process]`` table: how raw scans are processed. It states the registration model, the radius of
+    the tip, and the name of a file with a levelling recipe.
 
     If ``level`` is missing and the card does not say that the scans are levelled, a plane is fitted to each
     scan together with the layout, and this plane is subtracted. ``tip`` is the radius of the microscope's tip
@@ -206,8 +206,8 @@ class Ids(Record):
 
 class Standard(Record):
     """A scan of a calibration standard, whose size is known. Reading options that are not given here are
-    taken from the card's ``[scan]`` table. A unit or size from the ``[scan]`` table is used only if the file
-    states none, as for scans.
+    taken from the card's ``[scan]`` table. As for scans, a unit or size from the ``[scan]`` table is used
+    only if the file states none.
     """
 
     file: InsidePath

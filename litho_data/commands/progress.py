@@ -15,8 +15,8 @@ T = TypeVar("T")
 # Shortest elapsed time from which the remaining time is estimated, and shortest remaining time that is
 # reported, in seconds.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
-# A command that has printed nothing for this time, in seconds, reports that it is at work. Together with the
-# time that the command takes to start, users wait for five seconds.
+# A command that has printed nothing for this time, in seconds, reports that it is at work. Users wait for
+# five seconds, because the command also takes time to start.
 _SILENT_S = 3.0
 _silent = threading.Event()
 
@@ -94,7 +94,7 @@ def say(what: str) -> None:
 
 @contextmanager
 def never_silent(name: str) -> Iterator[None]:
-    """Print that a command is at work if it prints nothing else in its first seconds."""
+    """If a command prints nothing in its first seconds, print that it is at work."""
 
     def speak() -> None:
         if _silent.is_set():

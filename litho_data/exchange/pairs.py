@@ -59,9 +59,9 @@ def import_pairs(
     The height of a pixel is grey value / 255 · full scale. In the authors' own files, heights were rounded
     down to a grey value, so they are too low by half a grey value (about 2 nm) on average.
 
-    If the folder contains ``valid/``, heights are not valid at the black pixels of these masks. Otherwise,
-    all pixels are valid, and a field is reported if its heights are 0 along a whole side, because this side
-    was probably not measured.
+    If the folder contains ``valid/``, the files in it are masks, and heights at the black pixels of a mask
+    are not valid. Otherwise, all pixels are valid, and a field is reported if its heights are 0 along a whole
+    side, because this side was probably not measured.
 
     Args:
         folder: folder that contains ``mask/``, ``afm/``, ``src_max_dict.txt`` and possibly ``valid/``.

@@ -36,7 +36,7 @@ def write_card(
     The scans may be added later.
 
     Args:
-        folder: folder that contains both subfolders, in which the card is written.
+        folder: folder in which the card is written. It contains both subfolders.
         name: name of the dataset.
         title: title of the dataset, on one line.
         pitch_um: pixel pitch of the layouts, µm.

@@ -34,8 +34,8 @@ _TREAD_UM = 3.0
 
 @dataclass(frozen=True)
 class NamedLayout:
-    """One layout with its id, its relative dose, and the use of its scan, as the table of a dataset card
-    states it.
+    """One layout, and what the table of the dataset card states about it: its id, its relative dose, and the
+    use of its scan.
     """
 
     id: str
@@ -103,7 +103,7 @@ def write_layout_set(
 
     Raises:
         InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the
-            folder contains scans or anything else but a set that was made with these settings.
+            folder contains scans, files of another kind, or a set that was made with other settings.
     """
     require_known("pattern", pattern, PATTERNS)
     LEVELS.require("levels of a layout", levels)

@@ -1,5 +1,5 @@
-"""Measure roughness, noise and step heights of scans, and compute how much of the roughness levelling
-removes.
+"""Measure roughness, noise and step heights of scans, and compute how much of the roughness is removed by
+levelling.
 """
 
 from litho_data.roughness.amplitude import (

@@ -99,8 +99,8 @@ def effective_samples(height_um: Array) -> float:
 
     The formula holds for Gaussian surfaces, whose estimated mean square has the relative variance ``2 Σ ρ² /
     pixels``. The sum excludes lags beyond a quarter of the field, because the estimated ρ is nothing but
-    noise there. At all other lags, the estimated ρ contains noise, whose expected square is Σ ρ² divided by
-    the number of pixel pairs at this lag. The sum is corrected for this noise.
+    noise there. The estimated ρ at each remaining lag contains noise, too. The expected square of this noise
+    is Σ ρ² divided by the number of pixel pairs with this lag, and the sum is corrected for it.
     """
     correlation = autocorrelation(height_um)
     centre = correlation.shape[1] // 2

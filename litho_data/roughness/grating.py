@@ -116,8 +116,8 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
     shear.
 
     If stated lengths along an axis are too short by the factor c, measured frequencies along this axis are
-    too high by the factor c. A grating with the measured frequencies x and y therefore has the true squared
-    frequency (x / c_x)² + (y / c_y)², whatever its angle.
+    too high by the factor c. A grating with the measured frequencies f_x and f_y along the two axes therefore
+    has the true squared frequency (f_x / c_x)² + (f_y / c_y)², whatever its angle.
 
     Args:
         waves: for each grating, the measured wave, the known period and its standard uncertainty (µm).
@@ -216,8 +216,9 @@ def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, flo
 
 
 def _wider(freedom: int) -> float:
-    """Return the standard deviation of Student's t with this number of degrees of freedom.
+    """Return the standard deviation of Student's t with this number of degrees of freedom. For one or two
+    degrees of freedom it is not finite, and 3 is returned.
 
-    An uncertainty is multiplied by this factor if its scatter was estimated from few phases.
+    An uncertainty that is computed from the scatter of a few phases is multiplied by this factor.
     """
     return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

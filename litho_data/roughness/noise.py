@@ -1,4 +1,4 @@
-"""Estimate the noise of single pixels and the noise of whole scan lines, apart from the structure of the
+"""Estimate the noise of single pixels and the noise of whole scan lines, leaving out the structure of the
 print.
 """
 

@@ -20,7 +20,8 @@ _OWN = 3
 # that are 0, 1 or 2 steps apart have a correlation of 1, 4/9 or 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
-# Lowest frequency that is used, in cycles per field. Lower frequencies contain what levelling left of a bow.
+# Lowest frequency that is used, in cycles per field. Lower frequencies contain the rest of a bow that
+# levelling did not remove.
 _FIRST = 3
 
 
@@ -66,11 +67,12 @@ class LinePeriod:
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """Find the direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) contributes a vector. The length of this vector is the power at this frequency,
-    and its angle is twice the angle of (fx, fy), so that opposite directions count as the same. Each surface
-    is divided by its own variance. The powers P of a random surface are independent and exponentially
-    distributed. For an isotropic surface, the mean vector is therefore normally distributed with variance 1 /
-    n, where n = (Σ P)² / Σ P² is the effective number of frequencies.
+    For each frequency (fx, fy), a vector is computed. Its length is the power at this frequency, and its
+    angle is twice the angle of (fx, fy), so that opposite directions count as the same. The direction of the
+    lines follows from the mean of these vectors. The powers of each surface are divided by their sum. The
+    powers P of a random surface are exponentially distributed. For an isotropic surface, the mean vector is
+    therefore normally distributed with variance 1 / n, where n is the effective number of independent
+    frequencies: (Σ P)² / Σ P², reduced because the Hann window correlates neighbouring powers.
 
     Args:
         heights_um: levelled heights in µm, one array of shape (ny, nx) per surface. The pixels must be
@@ -161,8 +163,8 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
     """For each frequency, return the power expected from the powers at the surrounding frequencies, and the
-    probability that chance alone would raise the power as far above the expected power. ``scans`` is the
-    number of scans over which the powers were averaged.
+    probability that chance alone would raise the power at least as far above the expected power as was
+    observed. ``scans`` is the number of scans over which the powers were averaged.
     """
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)

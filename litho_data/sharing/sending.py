@@ -25,9 +25,9 @@ class Known:
     """Large objects that jobs use but that are not sent to other processes. Every process makes these objects
     itself, and the pickled jobs and results contain only their names.
 
-    ``make`` is a function that returns the same ``objects``, keyed by name. It must be importable by name, or
-    be a ``functools.partial`` of such a function. A process keeps only the objects that it made most
-    recently.
+    ``objects`` are the objects of this process, keyed by name. ``make`` is a function with which another
+    process makes equal objects with the same names. It must be importable by name, or be a
+    ``functools.partial`` of such a function. A process keeps only the objects that it made most recently.
     """
 
     make: Callable[[], Facts]
@@ -141,7 +141,8 @@ def _keep_freed_memory() -> None:
     """Let a Dask worker reuse freed memory, as processes do by default.
 
     Dask starts its workers with the environment variable MALLOC_TRIM_THRESHOLD_, with which every array above
-    128 KiB gets new memory pages from the system. This would take a third of the time of a build.
+    128 KiB gets new memory pages from the system. Requesting these pages would take a third of the time of a
+    build.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)):
         for parameter, value in _MALLOC.values():

@@ -309,8 +309,8 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Raise InputError if no Dask scheduler answers at the address. Without this check, a Dask client would
-    wait for a long time and then crash if another program listens there.
+    """Raise InputError if no Dask scheduler answers at the address. If another program listens at the
+    address, a Dask client without this check would wait for a long time and then crash.
     """
     from distributed.core import rpc
 

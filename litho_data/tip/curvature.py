@@ -71,8 +71,8 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Return the standard deviation, in 1/µm, that the given noise of the heights causes in the curvatures of
-    a flat surface as measured by ``highest_curvature``.
+    """Return the standard deviation, in 1/µm, of the curvatures that ``highest_curvature`` would measure on a
+    flat surface whose heights contain the given noise.
 
     The standard deviation is computed for the curvatures along x and along y, and the larger one is returned.
     """

@@ -43,8 +43,8 @@ class TipEstimate(RunFacts, Result):
         radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
         radius_sd_um: standard uncertainty of the estimate; None if the radius is only a bound.
         reason: why the radius is only a bound; empty if it is an estimate.
-        depth_um: range of heights, after removal of tilt and bow, in the scan from which the radius was
-            determined.
+        depth_um: range of heights in the scan from which the radius was determined, after its tilt and bow
+            are removed.
         reach_px: radius, in pixels, that a spike with the height ``depth_um`` has in the image. For the tip
             radius R, it corresponds to √(2 R depth_um).
         pixel_noise_nm, line_noise_nm: standard deviations of the noise of single pixels and of whole lines,
@@ -78,11 +78,11 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
 
     The radius is computed from the sharpest peaks, because no peak in an image is more sharply curved than
     the end of the tip. The result is an estimate if many peaks have the same maximum curvature and the
-    valleys are more sharply curved. Otherwise, the tip may be sharper than anything that it scanned, and the
-    result is only an upper bound.
+    valleys are more sharply curved than the peaks. Otherwise, the tip may be sharper than anything that it
+    scanned, and the result is only an upper bound.
 
     Args:
-        scans: scans that all have the same pitch. Whether they are levelled changes the result little.
+        scans: scans that all have the same pitch. Levelling them changes the result little.
 
     Raises:
         InputError: there is no scan, a scan has no pitch, the pitches differ, or a scan has fewer than 64 ×
