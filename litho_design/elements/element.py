@@ -40,10 +40,10 @@ class Element(nn.Module):
     behind the element.
 
     The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and
-    clipped to the range of the layout. The gradient ignores this step (straight-through estimator). A frozen
-    model predicts the print of these levels, which are surrounded by a guard ring of level 0. The printed
-    height h delays the wave by the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The wave
-    therefore always belongs to a printable layout. If you set ``element.whole = False``, for example during
+    clipped to the range of the layout, so the wave always belongs to a printable layout. The gradient ignores
+    this step (straight-through estimator). A frozen model predicts the print of these levels, which are
+    surrounded by a guard ring of level 0. The printed height h delays the wave by the phase 2 pi
+    (n(wavelength) - surroundings) h / wavelength. If you set ``element.whole = False``, for example during
     the first steps of a search, the levels are not rounded.
 
     Args:

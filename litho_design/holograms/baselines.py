@@ -37,8 +37,8 @@ def hologram_baselines(
     wave is found by forty Gerchberg-Saxton steps, which start from an image with a flat phase. ``continuous
     phase`` has one arbitrary phase per cell, without a printer and levels. These phases are found by a
     hundred descent steps on the loss of the design, which start from the result of the Gerchberg-Saxton
-    algorithm. The lowest loss is one of the scores. ``weighted GS`` also has one phase per cell, found by
-    forty weighted Gerchberg-Saxton steps.
+    algorithm. The lowest loss of these steps is one of the scores of ``continuous phase``. ``weighted GS``
+    also has one phase per cell, found by forty weighted Gerchberg-Saxton steps.
     """
     parts = settings.layout, settings.optics, settings.loss
     pixels = array_sha256(target.cpu().numpy(), "1", ("y", "x"))
@@ -74,8 +74,8 @@ def _baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Search for the phases of the element that send the most power to the signal, starting from a print.
-    Return the share of the incident power that then reaches the signal.
+    """Starting from the phases of a print, search for the phases of an element that sends the most power to
+    the signal. Return the share of the incident power that then reaches the signal.
 
     The signal is the set of pixels whose target exceeds 0.5. Each step is u <- exp(j arg P^H S P u), where u
     is the wave behind the element, P is the propagator and S is the mask of the signal. Every pixel has its

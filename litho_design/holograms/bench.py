@@ -116,8 +116,8 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     """Blur a target image of shape (m, m) to the resolution of an element of the same size.
 
     The target is convolved with the intensity in the focus of a square aperture, sinc^2(2 NA x / wavelength)
-    along both axes, where NA is the ``edge_sine`` of half the side. The target is treated as dark outside its
-    window.
+    along both axes. NA is the sine of the angle, seen from the image, between the axis and the middle of an
+    edge of the element (see ``Optics.edge_sine``). The target is treated as dark outside its window.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):

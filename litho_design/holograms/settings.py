@@ -60,8 +60,8 @@ def hologram_settings(
     levels, temperature 1, a wavelength of 0.633 µm and a refractive index step of 0.545. After more than ten
     iterations without progress, the learning rate is reduced to a tenth. The efficiency term in the code is
     constant, so it is omitted here. docs/from_the_authors_code.md lists the parts of that code that are not
-    reproduced. ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then polishes
-    the printable layout.
+    reproduced. ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then improves
+    the printable layout by changing levels by one.
 
     Args:
         variant: name of the preset. A ``variant`` among the changes overrides it.

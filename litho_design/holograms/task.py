@@ -113,7 +113,7 @@ class HologramTask(Task):
             return WindowedHologramScore(**score.model_dump(), **self._inside_window(self.bench(height_um)))
 
     def _too_fine(self, target: np.ndarray) -> list[str]:
-        """Return a list with one note if the strokes of the target are so narrow that diffraction blurs them,
+        """Return a list with one note if the lines of the target are so narrow that diffraction blurs them,
         whatever the layout. Otherwise, return an empty list.
         """
         layout, optics, window = self.settings.layout, self.settings.optics, self.settings.window
@@ -121,7 +121,7 @@ class HologramTask(Task):
         finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
         if stroke_um >= finest_um:
             return []
-        # The advised distance is rounded down, so that no stroke is too fine at this distance.
+        # The advised distance is rounded down, so that no line is too narrow at this distance.
         near_um = rounded_down(stroke_um / finest_um * optics.distance_um)
         near = optics.model_copy(update={"distance_um": near_um})
         # If the advised distance is small, the defocus in some draws of the process window would move the

@@ -1,7 +1,8 @@
-"""Divide a large element into bands of rows. Its print and the light behind it are computed band by band.
+"""Divide a large element into bands of rows. The print of the element and the light behind it are computed
+band by band.
 
-The bands depend only on the layout. One process and many processes use the same bands, numbered in the same
-way.
+The bands depend only on the layout and on the largest number of rows in a band. One process and many
+processes use the same bands, numbered in the same way.
 """
 
 from __future__ import annotations
@@ -96,7 +97,8 @@ class Bands:
         """Return the rows of this process, extended on both sides by ``halo`` rows of the neighbouring
         process, or by zeros at the edge of the element. ``values`` has shape (rows, x).
 
-        At most two bands contribute to the gradient of a row, so the order of summation has no effect.
+        In the backward pass, the gradient of a row is a sum over at most two bands, so it does not depend on
+        the order of the bands.
         """
         rank, count = self.ranks.rank, self.ranks.count
         # The neighbour above needs the first rows, and the neighbour below needs the last ones.

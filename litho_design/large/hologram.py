@@ -62,8 +62,8 @@ class BandedHologram(HologramTask):
     folder. The resulting layout does not depend on the number of processes.
 
     Args:
-        settings: settings of the hologram. This class does not check the settings of the search; use ``only``
-            for this.
+        settings: settings of the hologram. This class does not check the settings of the search; use the
+            function ``only`` for this.
         printer: frozen model with a finite reach, or nominal heights.
         bands: bands of the element.
         inputs: contains ``target``, the target image with values in [0, 1], shape (size, size), in memory or

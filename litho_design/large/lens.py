@@ -1,6 +1,5 @@
-"""Design a lens of any size ring by ring. The print and the light are computed only along one radius and
-never on the whole plane, because an element that is 10 mm wide has 10¹⁰ pixels but only 50,000 rings of 0.1
-µm.
+"""Design a lens of any size ring by ring. An element that is 10 mm wide has 10¹⁰ pixels but only 50,000 rings
+of 0.1 µm. The print and the light are therefore computed along one radius and never on the whole plane.
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ class RadiusMap(CellMap):
 
     def average(self, pixels: Tensor) -> Tensor:
         """Return the mean of real or complex pixel values over each ring. The pixels lie along one radius.
-        Each pixel represents all pixels at the same radius, so it is weighted with the area of the circle on
-        which they lie.
+        Each pixel represents all pixels at the same radius. Their number is proportional to the radius, so
+        each pixel is weighted with its radius.
         """
         area = self.area.to(pixels)
         sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
@@ -60,7 +59,7 @@ class RingLens(DirectLensTask):
     Args:
         settings: settings of the lens. They must state rings, a circular aperture and a thin element.
         printer: a frozen model with a finite reach, or nominal heights.
-        tile_px: length, in pixels, of the tiles in which the print of a strip along the radius is predicted.
+        tile_px: length of a tile in pixels. The print of a strip along the radius is predicted tile by tile.
 
     Raises:
         InputError: the settings or the printer are not supported for a lens of rings.
@@ -93,8 +92,9 @@ class RingLens(DirectLensTask):
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the existing bench, whatever the optics. A new bench for each draw of the process window
-        would take too long, because of its matrix. The search therefore uses only the optics in the settings.
+        """Return the existing bench, whatever the optics. Each draw of the process window has other optics,
+        but computing the matrix of a new bench for each of them would take too long. The search therefore
+        uses only the optics in the settings.
         """
         return self.bench
 

@@ -147,9 +147,9 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space. In a small element, steep rays would wrap around
-        within the length of the Fourier transform of this propagator. In this case, the kernel of
-        ``ASMPropagator`` is used, which has a longer period.
+        """Compute the transfer function of free space. If the element is small, the Fourier transform of this
+        propagator is too short, and steep rays would wrap around. The kernel of ``ASMPropagator``, which has
+        a longer period, is then used instead.
         """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]

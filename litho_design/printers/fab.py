@@ -20,8 +20,8 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# Number of the random stream for the surface roughness. The stream is separate, so that the roughness differs
-# from that of every scan that was simulated with the truth file.
+# Number of the random stream for the surface roughness. The stream is separate, so that no scan that was
+# simulated with the truth file has the same roughness.
 _ROUGHNESS_STREAM = 2
 
 
@@ -30,17 +30,17 @@ class ElementJob(Job):
     """A print job for a layout that stands alone on the substrate."""
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Surround the layout with a frame of level 0. The write field is as large as the layout without the
-        frame.
+        """Surround the layout with a frame of level 0. The write field has the size of the layout, and the
+        frame lies outside it.
         """
         framed = np.pad(self.level, GUARD_PX)
         return Canvas(framed, pitch_um, self.field_um, max(self.level.shape) * pitch_um)
 
 
 class FabSimulator(nn.Module):
-    """The virtual fab that a ``truth.json`` describes, called like a frozen model. Its prints have surface
-    roughness but no effects of a scan. It provides no gradients. The roughness is the same for all layouts of
-    the same size, so differences between their prints come only from the layouts.
+    """The virtual fab that a ``truth.json`` describes. It is called in the same way as a frozen model. Its
+    prints have surface roughness but no effects of a scan. It provides no gradients. The roughness is the
+    same for all layouts of the same size, so differences between their prints come only from the layouts.
     """
 
     name = "fab"

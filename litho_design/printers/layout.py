@@ -11,8 +11,8 @@ from litho_data.foundation.results import Record
 
 
 class LayoutSettings(Record):
-    """Geometry of a layout: its pixels, its free cells (areas with one level each, which the design chooses)
-    and its levels.
+    """Geometry of a layout: its pixels, its free cells and its levels. A free cell is an area of one level,
+    which the design chooses.
 
     ``cell_um`` is the side of a free cell or, if ``symmetry`` is "radial", the width of a ring.
     """

@@ -53,8 +53,8 @@ class Printer(nn.Module):
     The layout is therefore surrounded by a guard ring of level 0 before printing, and the print is cropped.
 
     Args:
-        simulator: a frozen model called as ``simulator(layout_um, pitch_um=...)``, or None for a
-            print equal to the nominal height.
+        simulator: a frozen model, which is called as ``simulator(layout_um, pitch_um=...)``. If None, the
+            print has the nominal heights.
         layout: geometry and levels of the element.
     """
 
@@ -105,8 +105,8 @@ class Printer(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Return the device of the printer. It is also set for nominal heights, which have no model: waves
-        are computed on it.
+        """Return the device of the printer. Waves are computed on this device too, so it is set even for
+        nominal heights, which have no model.
         """
         return self.device_marker.device
 
@@ -169,8 +169,8 @@ class Printer(nn.Module):
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
         count = min(4, size // tile_px)
-        # Tiles start at odd pixels, so that none of them coincides with an internal tile of the model. Such a
-        # tile would be compared with itself.
+        # Tiles start at odd pixel numbers, so that none of them coincides with an internal tile of the model.
+        # Such a tile would be compared with itself.
         starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
         off = []
         for start in (min(start, size - tile_px) for start in starts):
@@ -217,7 +217,7 @@ class Printer(nn.Module):
 
     @torch.no_grad()
     def level_heights_um(self) -> list[float]:
-        """Return the printed height of a wide uniform field of each level, µm, for the table of levels."""
+        """For each level, return the printed height of a wide uniform field, µm."""
         if self._level_heights_um:
             return self._level_heights_um
         size = 2 * self.guard_px + 16
@@ -247,9 +247,9 @@ def _borders_px(simulator: Any) -> tuple[int, int, int]:
     """Return three widths in pixels: of the guard ring, of the halo of a patch, and of the halo of a two-row
     strip.
 
-    If a model runs on tiles internally, a patch needs a halo as wide as a tile. A strip of two rows can have
-    a narrower halo. The strip lies where the model blends two rows of tiles, and there, the mean of two tiles
-    has a smaller error than a single tile.
+    If a model divides layouts into tiles internally, a patch needs a halo as wide as a tile. A strip of two
+    rows needs only a narrower halo, because it lies where two rows of tiles overlap. The model averages the
+    two tiles there, and this mean has a smaller error than a single tile.
     """
     guard = simulator.guard_px
     tile = getattr(simulator, "tile", None)

@@ -101,8 +101,8 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Load those models of the zoo in ``JUDGES`` that were trained on the same prints as the first of the
-    ``known`` models.
+    """Of the zoo's models that ``JUDGES`` names, load those that were trained on the same prints as the first
+    of the ``known`` models.
 
     The ``known`` models themselves are left out, and so are models that were not calibrated for the layout.
     """

@@ -32,10 +32,10 @@ _ALLOWED_SHARE = 0.005
 class OutOfDistribution(Record):
     """The distance of a layout from the model's training layouts.
 
-    The distance consists of two total-variation distances: between histograms of levels, and between
-    histograms of the steps of neighbouring pixels. ``unusual`` lists the levels and steps that are much more
-    frequent in the layout than in the training layouts. ``step_distance`` is None if the model's card has no
-    histogram of steps.
+    The distance consists of two total-variation distances: one between the histograms of levels, and one
+    between the histograms of steps. A step is the difference in level between neighbouring pixels.
+    ``unusual`` lists the levels and steps that are much more frequent in the layout than in the training
+    layouts. ``step_distance`` is None if the model's card has no histogram of steps.
     """
 
     # Records of earlier versions also contain the scores of a second layout, which is closer to the training
@@ -82,11 +82,12 @@ def out_of_distribution(
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
     """Return the penalty on a layout whose levels and steps are unlike those in the training layouts. For
-    every k, three shares are computed: the pixels at level k or higher, the pixels at lower levels, and the
-    neighbours with steps of k or more. A share may be up to twice the same share of the training layouts, and
-    the penalty is the sum of all excesses. If the card has no histogram, the penalty is 0. Because these
-    shares are cumulative, the penalty has a gradient even at a pixel that lies several levels outside the
-    training layouts.
+    every k, three shares of the layout are computed: the share of the pixels at level k or higher, the share
+    of the pixels at lower levels, and the share of the pairs of neighbouring pixels with a step of k or more.
+    The limit of each share is twice the same share of the training layouts. The penalty is the sum of the
+    amounts by which shares exceed their limits. If the card has no histogram, the penalty is 0. Because these
+    shares are cumulative, the penalty has a gradient even at a pixel whose level is several levels above or
+    below those in the training layouts.
     """
     total = level.new_zeros(())
     trained, trained_steps = (
@@ -120,11 +121,11 @@ def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
     """Return the rms error, µm, that a model is expected to make on the print of a relief. ``relief_um`` is
     the standard deviation of the heights of this relief, µm.
 
-    Two errors are added in quadrature. The first is the error on the prints in the model's card; it is scaled
-    up if the relief is higher than these prints. The second is the standard deviation of the gains of these
-    prints, multiplied by ``relief_um``. The card states mean absolute errors; they are multiplied by sqrt(pi
-    / 2) to obtain rms errors, because errors are assumed to be normally distributed. If the card has no
-    prints, the result is 0.
+    Two errors are added in quadrature. The first is the mean error of the prints that the model's card lists;
+    it is scaled up if the heights of the relief vary more than the heights of these prints. The second is the
+    standard deviation of the gains of these prints (see ``ScanFigures``), multiplied by ``relief_um``. The
+    card states mean absolute errors; they are multiplied by sqrt(pi / 2) to obtain rms errors, because errors
+    are assumed to be normally distributed. If the card lists no prints, the result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:

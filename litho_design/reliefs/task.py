@@ -65,7 +65,7 @@ class ReliefTask(Task):
     The inputs ``first_level`` and ``first_print_um``, both of shape (size, size), are the layout of a first
     print and its measured heights. The deviation of the first print from its prediction is computed for each
     printer model. The next print is expected to have the same deviation, so ``printed`` adds it to the
-    prediction of the model. Search and scores then compare the expected real print with the target.
+    prediction of the model. The search and the scores then compare this expected real print with the target.
 
     Raises:
         InputError: the start in the settings works only for holograms or lenses, or the propagator is not
@@ -166,8 +166,8 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors of a print without ``offset_nm``. The zero of the heights is arbitrary, so the
-        offset must not decide whether the print passes.
+        """Return the errors of a print, leaving out ``offset_nm``. The zero of the heights is arbitrary, so
+        the offset must not decide whether the print passes.
         """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
@@ -183,7 +183,7 @@ class ReliefTask(Task):
 
     def untouched(self) -> dict[str, Tensor]:
         """Return two uncorrected layouts: ``uncorrected``, whose nominal heights are the target heights, and
-        ``best affine``, whose levels are gain * height + zero.
+        ``best affine``, whose levels are ``gain * height + zero``.
         """
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
@@ -211,8 +211,8 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Return the levels gain * height + zero, shape (size, size). The gain and the zero minimise the loss
-        over the printers of the search.
+        """Return the levels ``gain * height + zero``, shape (size, size). The gain and the zero minimise the
+        loss over the printers of the search.
         """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
@@ -228,7 +228,7 @@ class ReliefTask(Task):
         return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
 
     def _affine(self, gain: float, zero: float) -> Tensor:
-        """Return the levels gain * (height above the lowest point) + zero, rounded and limited to the
+        """Return the levels ``gain * (height above the lowest point) + zero``, rounded and limited to the
         printable levels. The result has shape (size, size).
         """
         layout = self.settings.layout
@@ -237,8 +237,8 @@ class ReliefTask(Task):
 
     @torch.no_grad()
     def _expected(self, levels: Tensor) -> float:
-        """Round ``levels``, one real level per cell. Return the loss of the result over the printers of the
-        search.
+        """Round ``levels``, one real level per cell. Return the loss of the rounded levels, combined over the
+        printers of the search.
         """
         whole = self.cells(levels.round())[None, None].float()
         losses = torch.stack([self.loss_by(one, self.printed(whole, one))[0] for one in self.printers])

@@ -1,4 +1,4 @@
-"""Sentences, for commands and reports, that advise the user on a layout before it is printed."""
+"""Write the sentences with which commands and reports advise the user on a layout before it is printed."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
     """Return a sentence about one score: its value according to the first model, its median over all models,
     and its worst value.
 
-    If the models disagree by more than ``gain``, a second sentence states both values.
+    If the models disagree by more than ``gain``, a second sentence states this disagreement and the gain.
 
     Args:
         less: True if lower values are better.
@@ -140,8 +140,8 @@ def _parted(figure: str) -> tuple[str, str]:
 
 
 def thickness_warning(design: Design) -> str:
-    """Return a warning if the efficiency of the print is clearly lower when it is computed as a thick
-    element. Otherwise, return an empty text.
+    """Return a warning if the print, computed as a thick element, has a clearly lower efficiency than as a
+    thin one. Otherwise, return an empty text.
     """
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
@@ -183,7 +183,7 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """Return the summary of a score that a command prints when it ends. For a measurement, the summary
+    """Return the summary of the scores, which a command prints when it ends. The summary of a measurement
     includes the uncertainties.
     """
     sd = uncertainty or {}

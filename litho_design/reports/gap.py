@@ -99,8 +99,8 @@ def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """Return sentences that name the best arm (model used for design) according to each judge. If some judges
-    are not arms, only these judges are used.
+    """Return sentences that name the best arm (model used for design) according to each judge. If there are
+    judges that are not arms, the sentences are only about these judges.
     """
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = 1 if figure in registered_task(result.task).errors else -1

@@ -24,7 +24,7 @@ _LARGE, _SMALL = 4.3, 2.4
 
 class Panel(NamedTuple):
     """A map of shape (m, m) to draw, which is ``side_um`` wide. ``colours`` is the name of its matplotlib
-    colour map. If it has a unit, a colour bar is drawn.
+    colour map. If ``unit`` is given, a colour bar is drawn.
     """
 
     title: str
@@ -117,8 +117,8 @@ def yield_figure(
 
     Args:
         draws: scores of each print, keyed by name.
-        figures: for each score to be drawn, its value for the print that the model predicts, and its label,
-            keyed by the name of the score.
+        figures: dict from the name of each score to be drawn to a pair: the value of this score for the print
+            that the model predicts, and its label.
         falling: names of the scores that are better when lower.
     """
     figure = new_figure(8, 3)

@@ -73,7 +73,7 @@ def new_sheet(
 
     Raises:
         InputError: ``compare`` or ``export`` rejects an argument, or the fields are too small for the
-            staircase.
+            staircase pattern.
     """
     made = settings or small_hologram()
     asked = {"model": str(model), "format": format, "layouts": layouts, "seed": seed}

@@ -41,11 +41,12 @@ class How(TypedDict, total=False):
     """Arguments that all design functions share.
 
     Attributes:
-        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The width of the
-            design is the range of the scores that these models predict. By default, the judges are the zoo's
-            models that were trained on the same prints as the model of the design.
-        robust: use the judges that have gradients in the search, too. ``Task.over_models`` then combines the
-            losses according to all models, and a penalty on the disagreement of the models is added.
+        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of the
+            scores that these models predict is called the width of the design. By default, the judges are the
+            zoo's models that were trained on the same prints as the model of the design.
+        robust: also use in the search those judges that provide gradients. ``Task.over_models`` then combines
+            the losses computed with the individual models, and a penalty on the disagreement of the models is
+            added.
         device: torch device on which prints and waves are computed.
         extrapolate: accept heights beyond the range for which a model was calibrated; the result records this
             choice.
@@ -78,7 +79,8 @@ def design_hologram(
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
         band_px: if given, the element is designed in bands of at most this many rows, because it is too large
             for the memory of one process. Processes started by torchrun share the bands; with ``cuda``, each
-            process uses its own GPU. The model must have a finite reach, and there are no judges.
+            process uses its own GPU. The model must have a finite reach (distance up to which a level affects
+            the print), and there are no judges.
         how: judges, robust, device, extrapolate, announce (see ``How``).
 
     Returns:
@@ -182,7 +184,8 @@ def correct(
     Raises:
         InputError: ``load_relief`` rejects the relief; the model or the folder is rejected for the reasons
             that ``design_hologram`` lists; only one of ``after`` and ``scan`` is given; the size, pitch or
-            levels of the first element differ from those in ``settings``; or the scan shows another element.
+            levels of the design in ``after`` differ from those in ``settings``; or the scan shows another
+            element.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
@@ -267,8 +270,8 @@ def _designed(
     extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """Run the design of the task that ``make`` returns. The printers are checked before ``make`` is called
-    and reads a target.
+    """Run the design of the task that ``make`` returns. The printers are checked first. Only then is ``make``
+    called, which reads the target.
     """
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
@@ -283,8 +286,8 @@ def _designed(
 
 
 def _alone(how: How, *objects: Any) -> How:
-    """Check that no objects, no judges and no robust search are requested for a large element, which supports
-    none of them. Return the arguments with an empty list of judges.
+    """Check that neither objects nor judges nor a robust search are requested. A large element supports none
+    of them. Return the arguments with an empty list of judges.
     """
     if how.get("robust") or objects or how.get("judges"):
         got = "objects, judges or a robust search"
