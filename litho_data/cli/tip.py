@@ -45,7 +45,7 @@ def tip(
         return
     if found.radius_um is None:
         raise InputError(
-            "maps of the tip",
+            "--maps",
             got=found.reason,
             wanted="scans from which the radius, or an upper limit on it, can be estimated",
         )

@@ -163,7 +163,7 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
     if loss > _MOST_LOSS:
         raise InputError(
             "the layout cannot be told from the background",
-            got=f"an error {loss:.1g} times that without a layout",
+            got=f"an error {loss:.1g} times as large as without a layout",
             wanted="a lower degree or a layout with independent structure",
         )
     solution = scale * (directions @ ((directions.T @ (scale * right)) / values))

@@ -183,7 +183,7 @@ def test_a_layout_that_is_a_ramp_cannot_be_told_from_tilt() -> None:
     with pytest.raises(InputError, match="the layout cannot be told from the background"):
         level_layout_aware(z, layout_level=ramp, blur_px=0.0)
     # Whole levels differ from the ramp by their rounding, which is less and less as their number grows.
-    with pytest.raises(InputError, match=r"an error \de\+03 times that without a layout"):
+    with pytest.raises(InputError, match=r"an error \de\+03 times as large as without a layout"):
         level_layout_aware(z, layout_level=np.round(40 * ramp), blur_px=2.0)
     for wrong, message in ((np.zeros((3, 3)), "shape"), (np.full(SHAPE, np.nan), "covers no measured pixel")):
         with pytest.raises(InputError, match=message):
