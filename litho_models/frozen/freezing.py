@@ -71,7 +71,7 @@ def freeze(
     if taken and printer is simulator:
         raise InputError(
             f"attributing {SCAN_AXIS} to the printer",
-            got=f"{card.name}, which was frozen without it",
+            got=f"{card.name}, which was frozen without this effect",
             wanted="a folder that `train` or `close-loop` wrote",
         )
     kept = card.model_dump(mode="json", by_alias=True, exclude={"name", "process_effects", "versions"})

@@ -50,7 +50,7 @@ def analyse_noise(
     """
     if model is not None and residuals is None:
         raise InputError(
-            "model", got=f"{model} without residuals", wanted="a benchmark from which the model can be chosen"
+            "name of a model", got=f"{model} without residuals", wanted="a benchmark that contains this model"
         )
     dataset = open_store(store)
     with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):

@@ -93,9 +93,9 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
         name, maps, protocol, held_out = _of_frozen(store, folder)
     else:
         raise InputError(
-            "model",
-            got=f"{model} with a frozen model",
-            wanted="a benchmark from which the model can be chosen",
+            "name of a model",
+            got=f"{model} together with a frozen model",
+            wanted="a benchmark that contains this model, or no name",
         )
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id in maps]
     if not scans:

@@ -356,7 +356,7 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
     assert "a part for predicting measured maps" in cards["microscope"].limitations[-1]
     assert cards["printer"].process_effects == {}
     assert cards["again"].attributed == {"scan-axis": "printer"}
-    with pytest.raises(InputError, match="frozen without it"):
+    with pytest.raises(InputError, match="frozen without this effect"):
         freeze(tmp_path / "left", tmp_path / "wrong", {"scan-axis": "printer"})
 
 
