@@ -130,9 +130,9 @@ class HologramTask(Task):
         defocus = "or less" if calm_um == window.defocus_sd_um else f"with --defocus-sd-um {calm_um:.2g}"
         closer = f"--distance-um {near_um:.2g} {defocus}, " if calm_um else ""
         return [
-            f"the image will be blurred: the strokes of the target are about {stroke_um:.2g} µm wide, but an "
+            f"the image will be blurred: the lines of the target are about {stroke_um:.2g} µm wide, but an "
             f"element of {layout.size_um:.4g} µm at {optics.distance_um:g} µm resolves no detail finer than "
-            f"λz/D = {finest_um:.2g} µm; use {closer}a larger --size-px, or bolder strokes"
+            f"λz/D = {finest_um:.2g} µm; use {closer}a larger --size-px, or thicker lines"
         ]
 
     def _inside_window(self, seen: Tensor) -> dict[str, float]:

@@ -88,8 +88,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if source.imaged is not None:
         raise InputError(
             "photographed object",
-            got="one for the design of a hologram",
-            wanted="one only for the design of a lens",
+            got="an object, although the design is a hologram",
+            wanted="an object only if the design is a lens",
             hint="leave out --camera-object",
         )
     power = source.power_counts
