@@ -38,8 +38,8 @@ class Check:
         state: the model, with all its effects.
         others: the causes and laws in the model; each of them is compared with the cause that is checked.
         laws, tables: all laws and tables that could replace a cause.
-        left_nm2: the part of the model's squared residual that features of layout and position can still
-            explain, nm².
+        left_nm2: the part of the model's squared residual that can still be explained by features of layout
+            and position, nm².
         secants: the changes that the laws and tables would make to the predictions.
     """
 
@@ -87,9 +87,9 @@ class Check:
         model. Return the name of this other effect, or an empty text if there is none.
 
         The gain of the other effect must be more than ten times the gain of this cause. If the other effect
-        is a law, this is sufficient, because every law is approximate. If it is a cause, there is a second
-        condition: without this cause, variants of the change that the other effect makes must reduce the
-        error by at least half of the gain of this cause.
+        is a law, this is sufficient, because every law is approximate. If the other effect is a cause, there
+        is a second condition. It is tested in the model without this cause: variants of the other effect's
+        change must reduce the error by at least half of this cause's gain.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -102,10 +102,10 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Compare a cause with short laws that are put in its place. Reject the cause if the laws fit better.
-        It must have passed the checks of ``of`` before.
+        """Replace a cause, which has passed the checks of ``of``, by short laws. Reject the cause if the
+        model with the laws fits better.
 
-        There are at most two laws. Together, they have no more parameters than the cause.
+        At most two laws are used. Together, they have no more parameters than the cause.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
@@ -119,8 +119,8 @@ class Check:
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Compare a cause with a table that is put in its place. Reject the cause if the table explains more.
-        It must have passed the checks of ``of`` before.
+        """Replace a cause, which has passed the checks of ``of``, by a table. Reject the cause if the table
+        explains more.
 
         The cause is rejected if two conditions hold: the gain of the table is more than twice the gain of the
         cause, and held-out scans do not confirm the cause when it is added to the model with this table.
@@ -153,8 +153,8 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Add variants of the change that a cause makes to the prediction. Return the resulting decrease of the
-    squared error on held-out scans, nm².
+    """A cause changes the prediction. Add variants of this change to the model, and return the decrease of
+    the squared error on held-out scans, nm².
 
     Args:
         without: model without the cause.

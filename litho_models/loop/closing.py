@@ -49,12 +49,12 @@ class Closed:
         plain: the chosen base model, fitted to the original scans.
         base: the chosen base model, fitted to the corrected scans (see ``study``).
         named: result of the search for causes, after all checks.
-        lawful: result of the search for short laws, which are added to the model with the causes.
-        described: result of the search for tables, which are added to the model with the causes and laws. A
-            table describes the remaining error as a function of one variable, such as level or position.
-            Tables act after all other effects of the printer and before those of the microscope.
-        rest: function that returns the part of a model's residual that features of layout and position can
-            still explain.
+        lawful: result of the search for short laws. They are added to the model after the causes.
+        described: result of the search for tables. They are added to the model after the causes and the laws.
+            A table describes the remaining error as a function of one variable, such as level or position.
+            Tables act after all other effects of the printer and before the effects of the microscope.
+        rest: function that returns the part of a model's residual that can still be explained by features of
+            layout and position.
         untestable: effects that the scans could not test, each with the reason.
     """
 
@@ -75,8 +75,8 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the corrected scans. Measurement errors that all scans of a group have in common are
-        subtracted from them.
+        """Return the corrected scans. The measurement errors that the scans of a group have in common have
+        been subtracted from these scans.
         """
         return self.base.study
 
@@ -92,9 +92,9 @@ class Closed:
 
     @cached_property
     def rests(self) -> dict[str, Rest]:
-        """Return the part of the residual that features of layout and position can still explain. The result
-        is keyed by the stage of the loop: ``base``, ``causes``, ``laws`` or ``tables``. A stage that did not
-        change the model is left out.
+        """Return the part of the residual that can still be explained by features of layout and position. The
+        result is keyed by the stage of the loop: ``base``, ``causes``, ``laws`` or ``tables``. A stage that
+        did not change the model is left out.
         """
         added = {"causes": self.named, "laws": self.lawful, "tables": self.described}
         stages = {"base": self.base} | {stage: found.state for stage, found in added.items()}
@@ -177,8 +177,9 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 def with_answer(
     closed: Closed, cause: Cause | None, name: str, values: Mapping[str, float], **known: Any
 ) -> Closed:
-    """Replace a cause or law in the result of a loop by the effect that later prints leave possible. Return
-    the new result. Each model that contains the cause is fitted again with this effect in its place.
+    """Update the result of a loop after later prints: replace a cause or law by the effect that is still
+    possible, and return the new result. Each model that contains the cause is fitted again with this effect
+    instead.
 
     Args:
         closed: the result.
@@ -214,8 +215,8 @@ def with_answer(
 
 
 def _rest_beside(start: State) -> Callable[[State], Rest]:
-    """Return a function that computes the part of a model's residual that features of the layout and of the
-    position can still explain. ``start`` is the fitted base model.
+    """Return a function that computes the part of a model's residual that can still be explained by features
+    of layout and position. ``start`` is the fitted base model.
     """
     scans = start.study.scans
     # The learner is made only when it is first needed. Loops that are repeated without a print seldom need
@@ -260,8 +261,8 @@ def _simplest(searches: Mapping[str, Found]) -> str:
     them is chosen.
 
     For each base model, count the causes that the search found with this base model but not with all others.
-    The model with the fewest such causes is the simplest. If several models have the same number, the one
-    with the fewest parameters, including those of its effects, is chosen.
+    The model with the fewest such causes is the simplest. If several models have the same number of such
+    causes, choose the model that has the fewest parameters together with its effects.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
@@ -277,8 +278,8 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
     """Search for laws and then for tables that the model with the causes still lacks. Then check each cause
-    in a model that also contains the laws. If a table gains more than all causes together, this model
-    contains the table, too.
+    in a model that also contains the laws. If a table reduces the error more than all causes together, this
+    model also contains the table.
 
     A cause that fails its check is removed, and the search for laws and tables is repeated without it. Return
     the result of the search for laws and the result of the search for tables.

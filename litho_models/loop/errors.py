@@ -53,7 +53,7 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
     model again, all to the same scans.
 
     Args:
-        twin: the model of the printer from which its fit starts.
+        twin: the model of the printer. Its parameters are the starting values of the fit.
         scans: the original scans.
         seed: seed for learning the measurement model.
         refit: whether to fit the model of the printer after the first fit of the measurement model. If not,
@@ -120,7 +120,7 @@ def error_rows(
 
 
 class HeldOut:
-    """Predict each scan of a study by a model of the printer and a measurement model, both of which are
+    """Predict each scan of a study. For this prediction, a model of the printer and a measurement model are
     fitted again to other scans of the study.
 
     Args:
@@ -198,8 +198,8 @@ class HeldOut:
         maps, and the numbers of parameters of the printer model and the measurement model in the largest fit.
 
         Args:
-            starts: model from which the fit without a part starts, keyed by the part.
-            part_of: part to which each scan belongs, one per scan.
+            starts: for each part, the model from which the fit without this part starts.
+            part_of: for each scan, the part to which it belongs.
             refit: whether the model of the printer is fitted again.
         """
         scans, jobs = self.study.scans, []

@@ -1,9 +1,10 @@
 """Decide whether held-out scans confirm a change of the model. Each scan counts as one observation.
 
-First, the change must have the right sign in most scans: if a scan contains the effect, the change of the
-prediction has a positive inner product with the residual before the change. A sign-flip test over the scans
-checks this condition. Second, the change must lower the error when it has the same strength in all scans (or
-in all scans of a group): the confidence interval of the gain must lie above zero.
+Two conditions must hold. First, the change must have the right sign in most scans. In a scan that contains
+the effect, the inner product of the change of the prediction with the residual before the change is positive.
+A sign-flip test of these products checks this condition. Second, the change must reduce the error although
+its strength is the same in all scans (or in all scans of a group). The confidence interval of this reduction
+must lie above zero.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ class Judgement:
         """Return the reason why the held-out scans do not confirm the change. The text is empty if they
         confirm it.
 
-        ``by`` is the grouping of the scans by which the strength differs, or ``all`` if it is the same in all
-        scans.
+        ``by`` is ``all`` if the strength is the same in all scans, and otherwise the name of the grouping
+        with one strength per group.
         """
         better, count = self.improved
         if count < FEWEST_SCANS:

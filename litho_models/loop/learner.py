@@ -1,4 +1,4 @@
-"""Estimate by a cross-validated ridge regression how much of a residual could still be learned.
+"""Use a cross-validated ridge regression to estimate how much of a residual could still be learned.
 
 The ridge regression uses features of layout and position. It names no cause and is not part of any model. It
 shows whether the residual has structure that could be learned, and by how much the error would then decrease.
@@ -86,8 +86,8 @@ class Learner:
 
     Args:
         study: the scans with their folds.
-        predictions: predicted height of each scan, µm, of shape (ny, nx), from which the free terms (such as
-            the gain) are computed.
+        predictions: predicted height of each scan, µm, of shape (ny, nx). It is used to compute the maps of
+            the free terms (such as the gain).
     """
 
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
@@ -113,7 +113,7 @@ class Learner:
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
-        fitted to the scans of other folds. Return the part that it explains.
+        fitted to the scans of other folds. Return the part that the regression explains.
 
         Args:
             predictions: predicted height of each scan, µm, of shape (ny, nx), by a model that was fitted

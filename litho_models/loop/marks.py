@@ -32,8 +32,8 @@ def with_marks(
     """Return the findings about per-scan terms together with those about marks.
 
     Args:
-        findings: the findings about per-scan terms. One of them is about the registration. The number of bent
-            scans is added to it, because the registration has straightened these scans.
+        findings: the findings about per-scan terms. One of them is about the registration. The number of
+            scans that the registration has straightened is added to this finding.
         scans: the original scans.
         maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
         rounding_um: rounding step of the heights in the raw file of each scan, µm; empty if there are no raw
@@ -108,8 +108,8 @@ def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> tuple[int, int]:
 
 
 def _with_bends(finding: ScanFinding, scans: Sequence[PreparedScan]) -> ScanFinding:
-    """State in the finding about the registration how many scans were bent. The registration has straightened
-    them, and all other steps of the loop use the straightened scans.
+    """Add the number of bent scans to the finding about the registration. The registration has straightened
+    these scans, and all other steps of the loop use the straightened scans.
     """
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
     text = f"{finding.evidence}; the registration straightened {len(found_um)} of {len(scans)} scans"

@@ -74,9 +74,9 @@ class Slot:
 class Added:
     """The parameters of an effect in a model.
 
-    ``by`` is the grouping by which the amplitudes of the effect differ, or ``all`` if they are the same in
-    all scans. ``values`` contains the parameter values of each group, keyed by the label of the group. If
-    ``by`` is ``all``, the only label is ``""``.
+    ``by`` is ``all`` if the amplitudes of the effect are the same in all scans, and otherwise the name of the
+    grouping with one set of amplitudes per group. ``values`` contains the parameter values of each group,
+    keyed by the label of the group. If ``by`` is ``all``, the only label is ``""``.
     """
 
     by: str
@@ -97,8 +97,8 @@ class Twin:
     """A base model and effects with their parameter values. A fit changes only the numbers in ``vector``.
 
     Attributes:
-        base: the base model of the printer. Its parameters are refitted together with those of the effects if
-            there are few of them.
+        base: the base model of the printer. If it has few parameters, they are refitted together with the
+            parameters of the effects.
         numbers: values of the fitted parameters of the base; empty if the base is not refitted.
         effects: the parameter values of the effects, keyed by the name of the effect, in the order in which
             the effects were added.
@@ -165,9 +165,9 @@ class Twin:
         return replace(self, base=base.models[fold]) if isinstance(base, FoldedBase) else self
 
     def with_effect(self, name: str, by: str, values: Values) -> Twin:
-        """Return the twin with a further effect. ``by`` is the grouping by which its strength differs.
-        ``values`` contains its starting values, keyed by group label (``""`` if the strength is the same in
-        all scans).
+        """Return the twin with a further effect. ``by`` is ``all`` if its strength is the same in all scans,
+        and otherwise the name of the grouping with one strength per group. ``values`` contains the starting
+        values, keyed by group label (``""`` for ``all``).
         """
         return replace(self, effects={**self.effects, name: Added(by, values)})
 
@@ -198,15 +198,16 @@ class Twin:
         return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
-        """Return whether a parameter applies to this scan. It does so if it applies to the group of the scan
-        or to all scans.
+        """Return whether a parameter applies to this scan. Each parameter applies to all scans or to one
+        group of scans.
         """
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """Return the twin without strengths that the given scans cannot determine. The strengths of the
-        groups to which these scans belong are kept. The strengths of every other group are replaced by the
-        means of the kept strengths, or by values without effect if none is kept.
+        """Replace the strengths that the given scans do not determine, and return the new twin. The strengths
+        of the groups to which these scans belong are kept. The strengths of all other groups are replaced by
+        the means of the kept strengths. If no strength is kept, the null values are used, at which the effect
+        does nothing.
         """
         effects = {}
         for name, one in self.effects.items():

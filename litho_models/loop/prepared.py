@@ -44,8 +44,8 @@ class ExposedScan(PrintedScan):
 
 def exposed(scan: PrintedScan) -> PrintedScan:
     """Multiply the layout of a scan by its dose, because a smaller dose acts like a lower layout. The loop
-    predicts from the result. A scan without a dose, or with a dose of 1, is returned unchanged, so that
-    cached fits to this scan stay valid.
+    predicts prints from the resulting layout. A scan without a dose, or with a dose of 1, is returned
+    unchanged, so that cached fits to this scan stay valid.
     """
     return scan if scan.dose in (None, 1) else ExposedScan(**vars(scan), exposure=float(scan.dose))
 
@@ -205,7 +205,7 @@ def sample_border_px(size: int) -> int:
     """Return the width of the border of a scan that is left out of fits, in pixels. The pixels in this border
     have neighbours outside the layout. ``size`` is the length of the shorter axis of the scan.
 
-    The border is left out only of fits. Errors are scored on all pixels, as in the benchmark
+    Only fits leave out the border. Errors are scored on all pixels, as in the benchmark
     (``NuisanceProtocol.border_px``).
     """
     return min(8, size // 8)

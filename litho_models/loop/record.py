@@ -41,15 +41,15 @@ class ErrorRow(Record):
     Attributes:
         model: ``base`` for the base model, ``causes`` for the base model with the causes that were found, or
             ``all`` for the corrected model.
-        measurement: what was added to the predicted print. ``print alone`` adds nothing, ``published`` adds
-            the smooth background of the training scans (the published protocol), and ``shared`` adds the
-            changes of the whole measurement model.
+        measurement: what was added to the predicted print. With ``print alone``, nothing was added. With
+            ``published``, the smooth background of the training scans was added (the published protocol).
+            With ``shared``, the whole measurement model was applied.
         policy: name of the policy, which is a set of terms. These terms were fitted to each scan, using only
             pixels that are not scored.
         k: effective number of these terms.
         held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
-            the held-out scans were used neither for the fits nor for any choice, such as which effects to
-            add; only the base model was chosen with them.
+            the held-out scans were used neither for the fits nor for choices, such as which effects to add.
+            The only exception is the choice of the base model.
         printer_numbers: number of fitted parameters of the printer model.
         measurement_numbers: number of fitted parameters of the measurement model, in the fold where this
             number is largest.
@@ -112,8 +112,8 @@ class FoundEffect(Record):
     """An effect, law or table that was added to the model.
 
     Attributes:
-        by: the grouping by which the strength of the effect differs, or ``all`` if the strength is the same
-            in all scans.
+        by: ``all`` if the strength of the effect is the same in all scans, and otherwise the name of the
+            grouping with one strength per group.
         strengths: fitted values of each parameter, keyed by the name of the parameter. There is one value per
             group if the parameter differs by group, and otherwise a single value.
         confusable_with: other effects that look the same in these scans.
@@ -204,9 +204,10 @@ class Planted(Record):
 
     ``amount`` is the planted strength. ``rms_nm`` is the rms of the change that the planted effect makes,
     after the free terms of each scan have been fitted to this change and subtracted. ``named`` lists the
-    cause that the loop found and the effects that look the same. It is empty if the planted effect is not
-    among them, or if another base model with as few parameters does not need the cause. ``found`` is the
-    fitted strength; it is None if the effect is not in the model.
+    cause that the loop found and the effects that look the same, if the planted effect is among them;
+    otherwise it is empty. A cause counts only if the search has also found it with every other base model,
+    except base models with more parameters. ``found`` is the fitted strength; it is None if the effect is not
+    in the model.
     """
 
     name: str
@@ -219,7 +220,7 @@ class Planted(Record):
 
 class Explained(Record):
     """The squared error on held-out scans after one stage of the loop, nm², and the part of this error that
-    features of the layout and of the position can still explain, nm². ``matters`` is True if this part is
+    can still be explained by features of layout and position, nm². ``matters`` is True if this part is
     significant and exceeds 1 % of the error.
     """
 

@@ -101,8 +101,8 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 def _values(twin: Twin) -> dict[str, float]:
     """Return the fitted values of the parameters of the base model, keyed by name. Arrays of parameters are
-    left out. The values are in physical units if these are known. The result is empty if the base model was
-    not fitted.
+    left out. Where the physical unit of a value is known, the value is in this unit. The result is empty if
+    the base model was not fitted.
     """
     base, found = twin.fitted_base, {}
     if twin.own and isinstance(base, Simulator):

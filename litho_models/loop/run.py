@@ -72,9 +72,9 @@ def close_loop(
         base_settings: settings of a small base model, such as ``{"spot.sigma_um": 0.3}``.
         folds: number of folds. Each scan is predicted by models that were fitted without the scans of its
             fold.
-        nested: if ``folds`` or ``prints``, the loop is repeated once without each fold (or print), and the
-            result is scored on the fold (or print) that was left out. Only the choice of the base model is
-            not repeated.
+        nested: if ``folds`` or ``prints``, the loop is repeated for each fold (or print): it runs without
+            this fold (or print), and its result is scored on the scans that were left out. The base model is
+            not chosen again.
         inject: effects in the form ``NAME=AMOUNT``. Each effect is planted in copies of the scans to test
             whether the loop finds it.
         open_lock_box: whether to score the corrected model also on the locked scans.
@@ -89,7 +89,8 @@ def close_loop(
             The returned loop may differ from the one received.
         decided_by: hashes of the further stores that the function ``further`` uses. They are recorded in the
             settings.
-        left_out: for each scan of the further stores that is not used, a text with its name and the reason.
+        left_out: one text for each scan of the further stores that is not used, with the name of the scan and
+            the reason.
         report: function that receives the progress messages.
 
     Raises:
@@ -163,8 +164,8 @@ def close_loop(
 
 
 def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
-    """Return two lists: the scans with enough measured pixels, and for each other scan a text with its name
-    and the reason.
+    """Return two lists: the scans with enough measured pixels, and one text for each scan that has too few.
+    The text contains the name of the scan and the reason why it is left out.
     """
     scans = store.scans()
     few = [scan.id for scan in scans if np.count_nonzero(scan.usable) < FEWEST_PIXELS]
@@ -175,8 +176,8 @@ def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
-    """Repeat the loop with the chosen base model once without each fold (or print), and score the result on
-    the fold (or print) that was left out. Return the errors on all scans.
+    """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
+    print), and score its result on the scans that were left out. Return the errors on all scans.
     """
     scans = study.stored
     ids = [scan.id for scan in scans]

@@ -1,11 +1,11 @@
-"""Predict for every candidate effect how much it would reduce the squared error on held-out scans (its gain),
-without fitting it.
+"""Predict, without a fit, how much each candidate effect would reduce the squared error on held-out scans.
+This reduction is the gain of the effect.
 
-Each parameter set that is tried for an effect gives a column (regressor): the change (secant) that the effect
-with these parameters makes to the predictions of the current model. The gain is predicted by a linear
-regression of the residual on the columns of the effect. The regression coefficients, i.e. the strengths of
-the effect, are either the same in all scans or differ by group. The computation needs only the inner products
-of the residual and the columns of each scan.
+Several parameter sets are tried for an effect. Each set gives one regressor (column): the change (secant)
+that the effect with these parameters makes to the predictions of the current model. The gain is predicted by
+a linear regression of the residual on the columns of the effect. The regression coefficients, i.e. the
+strengths of the effect, are either the same in all scans or differ by group. The computation needs only the
+inner products of the residual and the columns of each scan.
 """
 
 from __future__ import annotations
@@ -68,12 +68,13 @@ class Trial:
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray, axis: int | None = None) -> np.ndarray:
-        """Return whether every amplitude lies on the allowed side of its null value, after each parameter set
-        has been multiplied by its factor in ``multiples``, which has shape (…, sets). With ``axis`` -1, each
-        multiple is judged by itself.
+        """Multiply each parameter set by its factor in ``multiples``, of shape (…, sets). Return whether
+        every amplitude then lies on the allowed side of its null value: one result per row of ``multiples``
+        if ``axis`` is -1, and otherwise one result for all rows.
 
         If an amplitude on the wrong side is small relative to the largest amplitude, it is attributed to
-        noise and ignored. The largest amplitude is taken over all groups, unless ``axis`` is -1.
+        noise and ignored. The largest amplitude is taken over all rows, or over a single row if ``axis`` is
+        -1.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -81,8 +82,8 @@ class Trial:
         return ~(wrong & (sizes > 0.3 * sizes.max(axis=axis, keepdims=True))).any(axis=axis)
 
     def reach(self, multiples: np.ndarray) -> np.ndarray:
-        """Return a factor for each multiple. If the steps of all amplitudes are multiplied by it, the
-        amplitudes stay within their ranges. It is the largest such factor, but at most 1.
+        """For each row of ``multiples``, return the largest factor, at most 1, by which the steps of all
+        amplitudes can be multiplied so that the amplitudes stay within their ranges.
 
         The full steps may lead out of the ranges, because they are obtained by linear extrapolation.
         """
@@ -176,15 +177,17 @@ class Screened:
 
     Attributes:
         trial: the parameter sets that were tried.
-        by: the grouping by which the strength differs, or ``all`` if the strength is the same in all scans.
-        gains_nm2: predicted decrease of the squared error of each scan, of shape (scans,), with strengths
-            that are fitted without the fold of this scan.
+        by: ``all`` if the strength is the same in all scans, and otherwise the name of the grouping with one
+            strength per group.
+        gains_nm2: predicted decrease of the squared error of each scan, of shape (scans,). The strengths are
+            fitted without the fold of this scan.
         multiples: the factors by which the parameter sets of the trial are multiplied, keyed by group label.
             They are fitted to all scans.
         allowed: whether the fitted amplitudes lie on physically possible sides of their null values.
-        retained: fraction of the squared norm of the columns that remains after a projection. The scan terms
-            and the changes that the model's own parameters can make are projected out.
-        beside_base: the same fraction if only the scan terms are projected out.
+        retained: fraction of a column's squared norm that remains after the scan terms and the changes that
+            the model's own parameters can make have been projected out. If the trial has several columns,
+            this is the largest of their fractions.
+        beside_base: the same fraction after only the scan terms have been projected out.
         family_p: p value of the candidate. The signs of the gains of the scans are flipped many times. The p
             value is the fraction of these flips in which the gain of at least one candidate reaches the gain
             of this one.
@@ -312,8 +315,8 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Return the candidate with the best grouping of its strength. Return None if its gain is not
-        significantly larger than with a strength that is the same in all scans.
+        """Return the candidate with the best grouping of the scans. Return None if no grouping increases the
+        gain significantly compared with a strength that is the same in all scans.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         options = {
@@ -372,8 +375,9 @@ class Screening:
     def best_grouping(
         self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, np.ndarray], np.ndarray]
     ) -> tuple[str, float] | None:
-        """Choose the grouping of the scans by which the strengths of a candidate differ. Only groupings with
-        nearly the largest gain are considered. Of these, the one with the fewest parameters is chosen.
+        """Choose the grouping of the scans for a candidate whose strengths differ between groups. Only
+        groupings with nearly the largest gain are considered. Of these, the grouping with the fewest
+        parameters is chosen.
 
         Args:
             options: gain in nm² and number of parameters of each grouping, keyed by the name of the grouping.
@@ -382,10 +386,10 @@ class Screening:
                 nm², of shape (groupings, scans).
 
         Returns:
-            The name of the chosen grouping, and its p value. This is the fraction of random permutations of
-            the scans in which the gain with any grouping is as large. Permutations that reproduce the chosen
-            grouping are not counted. The result is None if no grouping has a gain, or if the gain of the
-            chosen grouping is not significant.
+            The name of the chosen grouping, and its p value. The p value is the fraction of random
+            permutations of the scans in which the gain with at least one grouping reaches the gain with the
+            chosen grouping. Permutations that reproduce the chosen grouping are not counted. The result is
+            None if no grouping has a gain, or if the gain of the chosen grouping is not significant.
         """
         most = max((gain for gain, _ in options.values()), default=0.0)
         close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}

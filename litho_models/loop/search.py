@@ -34,7 +34,8 @@ class Cause:
 
     Attributes:
         name: name of the effect.
-        by: the grouping by which its strength differs, or ``all`` if its strength is the same in all scans.
+        by: ``all`` if the strength is the same in all scans, and otherwise the name of the grouping with one
+            strength per group.
         alike: other effects that look the same in these scans.
         judgement: the gain on held-out scans when the effect is added to the model with all other effects,
             and the test of this gain.
@@ -43,7 +44,7 @@ class Cause:
         values: for a table, the starting values of its parameters, keyed by group label.
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
         corrects: whether the effect was rejected because it may merely correct the formula of another effect.
-        excluded: effects that look the same in these scans, but that later prints exclude.
+        excluded: effects that look the same in these scans but were excluded by later prints.
         role: role of the effect (``process`` or ``measurement``, for example), if later prints decided it;
             otherwise None.
     """
@@ -102,8 +103,9 @@ def search(
         secants: changes that the candidates make to the predictions of a similar model. If they are given,
             they are used as approximations, and the changes of the predictions of the current model are not
             computed.
-        seed: result of the same search with another base model. If it is given, its effects are tested with
-            this base model. The search starts with those that held-out scans confirm.
+        seed: result of the same search with another base model. If it is given, the effects that it contains
+            are first tested in the model ``start``. The search continues from those effects that held-out
+            scans confirm.
     """
     found = Found(start)
     if seed and seed.causes:

@@ -1,5 +1,5 @@
-"""Find out which terms differ from scan to scan: datum, gain, bow, drift, registration errors and line
-offsets.
+"""Find out which of the following terms differ from scan to scan: datum, gain, bow, drift, registration
+errors and line offsets.
 
 Such terms cannot be predicted for the next print, so they are not part of any model. A term counts as present
 if it agrees between two halves of a scan: the term that is fitted to one half of the pixels must agree with
@@ -51,8 +51,8 @@ class SingleScans:
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
-        """Test all per-scan effects, one after the other, and return the findings. Each effect is tested in
-        addition to the effects that were found before it. Line offsets are tested last.
+        """Test all per-scan effects, one after the other, and return the findings. When an effect is tested,
+        the terms of all effects that were found before it are fitted, too. Line offsets are tested last.
         """
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
@@ -103,10 +103,10 @@ class SingleScans:
         """Test whether the heights contain offsets of whole lines. The lines are scan lines or rows of the
         layout.
 
-        The offsets of scan lines are compared with those of rows. Both are also compared with offsets of the
-        layout's columns, which serve as a control. Scans are slightly rotated relative to their layouts.
-        Offsets that follow the layout's rows come from the printer, and offsets that follow the scan lines
-        come from the microscope. If no scan were rotated, the two kinds of offsets could not be
+        The offsets of scan lines are compared with the offsets of rows. Both are also compared with offsets
+        of the layout's columns, which serve as a control. Scans are slightly rotated relative to their
+        layouts. Offsets that follow the layout's rows come from the printer, and offsets that follow the scan
+        lines come from the microscope. If no scan were rotated, the two kinds of offsets could not be
         distinguished.
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
@@ -198,8 +198,8 @@ def coefficients(
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
     """Judge a per-scan term by whether the two halves of each scan agree on it.
 
-    It would not be a suitable test to count the scans with a smaller error: if the term of a scan is near
-    zero, the error of this scan does not decrease.
+    Counting the scans with a smaller error would not be a suitable test, because the error of a scan does not
+    decrease if its term is near zero.
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
