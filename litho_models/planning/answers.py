@@ -1,6 +1,6 @@
-"""For each open question of a plan, compute the difference between the rivals (competing explanations) and
-the power, which is the probability that the planned prints decide the question correctly. Also list all
-possible outcomes.
+"""For each open question of a plan, compute how much the predictions of the rivals (competing explanations)
+differ. Also compute the power, i.e. the probability that the planned prints decide the question correctly,
+and list all possible outcomes.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
-    """Return the power of an experiment to decide between two rivals with the given number of prints. These
+    """Return the power of an experiment with the given number of prints to decide between two rivals. These
     prints are assumed to be like the prints for which the contrast was computed.
 
     The decision compares the squared errors of the two rivals. If one rival is true, the expected difference
     of the squared errors is the squared distance between the two predictions. The actual difference varies
-    about this value for two reasons. One is the noise, projected onto the difference of the predictions. The
-    other is that the squared distance varies between prints, with the relative spread ``question.spread``. An
-    error of ``form_nm`` in the form of the model may explain a part of the difference. This part is
-    subtracted, as in the decision itself.
+    about this value for two reasons. One reason is the noise, projected onto the difference of the
+    predictions. The other reason is that the squared distance varies between prints, with the relative spread
+    ``question.spread``. An error of ``form_nm`` in the form of the model may explain a part of the
+    difference. This part is subtracted, as in the decision itself.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -75,8 +75,8 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
     """Return the power to decide whether line offsets with standard deviation ``sd_um`` come from the printer
     or from the microscope.
 
-    The experiment uses rotated scans, in which the lines of the printer and those of the microscope run along
-    different axes. ``size_px`` is the side length of a print in pixels.
+    The experiment uses rotated scans, in which the lines of the printer and the lines of the microscope run
+    along different axes. ``size_px`` is the side length of a print in pixels.
     """
     grid = noise.on_grid((size_px, size_px))
     # The mean over a line has the noise power at frequency 0 along the line.
@@ -94,7 +94,7 @@ def prints_needed(powers: Sequence[float]) -> int | None:
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Subtract from a gain (difference of two squared errors) an allowance for the error of the model itself.
+    """Reduce a gain (difference of two squared errors) by an allowance for the error of the model itself.
     Return the rest in standard deviations of the noise. The result is 0 if the gain does not exceed the
     allowance.
 
@@ -191,8 +191,8 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Compare all pairs of rivals on the given prints. Either rival of a pair may be the true one. The power
-    is computed for both cases, and the smaller power is returned. In each case, the power is averaged over
+    """Compare all pairs of rivals on the given prints. Either rival of a pair may be true. The power is
+    computed for both cases, and the smaller power is returned. In each case, the power is averaged over
     random draws of the parameters of the rivals.
     """
     random, first = np.random.default_rng(0), rivalry.linearised(prints)

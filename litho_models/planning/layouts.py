@@ -81,7 +81,8 @@ class Limits:
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
         """Derive the limits from earlier prints. Very rare levels at both ends are excluded: the levels below
         the lowest allowed level together cover less than a thousandth of the area of these prints, and so do
-        the levels above the highest one. Structures must not be finer than the structures in these prints.
+        the levels above the highest allowed level. Structures must not be finer than the structures in these
+        prints.
 
         Raises:
             InputError: every earlier layout has only one level, or nearly the whole area of these layouts has
@@ -103,8 +104,8 @@ class Limits:
         return cls(lowest, highest, open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
-        """Low-pass filter unrestricted values and clip them to the range of the levels. The result contains
-        soft (not yet rounded) levels and has shape (ny, nx).
+        """Apply a low-pass filter to unrestricted values, and clip them to the range of the levels. The
+        result contains soft (not yet rounded) levels and has shape (ny, nx).
         """
         y, x = (torch.fft.fftfreq(n, self.pitch_um).abs() <= self.cutoff_per_um for n in free.shape)
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
@@ -117,8 +118,8 @@ class Limits:
         return above.astype(np.min_scalar_type(self.highest)) + self.lowest
 
     def price(self, soft: Tensor) -> Tensor:
-        """Return a penalty. It grows if the mean or the standard deviation of the levels is far from its
-        value in earlier prints.
+        """Return a penalty. It is 0 if the mean and the standard deviation of the levels are close to their
+        values in earlier prints, and grows with the distance from these values.
         """
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
@@ -339,7 +340,8 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return the self-similarity of a layout, as it is defined for registration.
+    """Return the self-similarity of a layout, i.e. how well it matches shifted copies of itself, as
+    registration measures it.
 
     If the value is 1, the layout matches a shifted copy of itself perfectly, and registration cannot
     determine the shift.

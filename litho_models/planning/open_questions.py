@@ -97,7 +97,7 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 
 
 class _Asking:
-    """Make the questions of a closed loop that have rivals."""
+    """Make those open questions of a closed loop that have rivals."""
 
     def __init__(self, closed: Closed):
         self.closed, self.study = closed, closed.study
@@ -128,7 +128,7 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """Return the question which of the unconfirmed effects, if any, explains the residual. An effect is
+        """Return the question of which unconfirmed effect, if any, explains the residual. An effect is
         unconfirmed if it is significant in screening and held-out scans did not confirm it. Return None if
         there is no such question.
         """

@@ -62,9 +62,9 @@ class NoiseSpectrum(Record):
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
-    """Fit the free per-scan terms to the measured minus the predicted height of a scan, and subtract them.
-    Return the remaining residual, nm. The result is a two-dimensional map without the pixels at the edge of
-    the scan.
+    """Fit the free per-scan terms to the residual of a scan (measured minus predicted height), and subtract
+    them. Return the remaining residual, nm. The result is a two-dimensional map without the pixels at the
+    edge of the scan.
 
     Pixels that were not measured are NaN.
     """
@@ -155,8 +155,8 @@ class Question(Record):
         spread: relative standard deviation, over scans, of the evidence for the effect, i.e. of the decrease
             of the squared error. The part that noise causes is not included.
         form_nm: upper bound, nm, on the rms error that is due to a wrong form of the model; None if it is
-            unknown. It is derived from the part of the residual that could still be learned. The model behind
-            this residual assumes one of the answers.
+            unknown. It is derived from the part of the residual that could still be learned. This is the
+            residual of a model that assumes one of the answers.
         sizes: standard deviations of the parameters of a per-scan term over scans, keyed by the name of the
             parameter.
     """

@@ -4,10 +4,10 @@ the noise.
 
 The criterion is T-optimality (Atkinson and Fedorov 1975): the distance from the prediction of one model to
 the nearest prediction that the other model can make. It is not known which of the two models is true, so the
-distance is computed in both directions, and the smaller one counts (a simple form of the symmetric criterion
-of Harman and Müller, arXiv:1709.10320). Datum, tilt, bow, gain and affine registration are fitted to every
-scan, so differences of these kinds do not count. The refitted model must stay consistent with earlier prints
-and within the ranges of its parameters.
+distance is computed in both directions, and the smaller distance counts (a simple form of the symmetric
+criterion of Harman and Müller, arXiv:1709.10320). Datum, tilt, bow, gain and affine registration are fitted
+to every scan, so differences of these kinds do not count. The refitted model must stay consistent with
+earlier prints and within the ranges of its parameters.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Way:
 
     ``turned_deg`` is the angle by which the print is rotated under the microscope. ``direction`` is 1 for the
     trace and -1 for the retrace. ``tip`` is 1 for the tip of earlier scans and 2 for a new, sharp tip.
-    ``pixel_size`` is the size of a pixel relative to that of earlier scans; the time per pixel stays the
-    same.
+    ``pixel_size`` is the size of a pixel relative to the pixel size of earlier scans; the time per pixel
+    stays the same.
     """
 
     turned_deg: int = 0
@@ -88,8 +88,8 @@ class Printing:
 
     def reach_um(self, printed: PlannedPrint) -> float:
         """Return the coordinate of the centre of a print relative to the centre of the write field, µm. It is
-        the same along x and y: a print at the edge lies in a corner of the write field. It is 0 for a print
-        at the centre, or if the width of the write field is unknown.
+        the same along x and y, because a print whose place is the edge lies in a corner of the write field.
+        It is 0 for a print at the centre, or if the width of the write field is unknown.
         """
         if printed.place == "centre" or self.write_field_um is None:
             return 0.0
@@ -192,8 +192,9 @@ class Rivalry:
         return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
-        """Return a copy with random parameters of the models that are assumed to be true. The parameters are
-        drawn from the normal distribution that describes their uncertainty after earlier prints.
+        """Return a copy in which the models that are assumed to be true have random parameters. The
+        parameters are drawn from the normal distribution that describes their uncertainty after earlier
+        prints.
         """
         other = copy.copy(self)
         other.true = []

@@ -90,9 +90,9 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]:
-    """Return two lists for a further store: the scans with enough measured pixels, and for each other scan a
-    text with its name and the reason. Before that, check two things: both stores must be of the same printer,
-    and the scans must have the orientation that the dataset card states.
+    """Check that a further store is of the same printer as the first store, and that its scans have the
+    orientation that its dataset card states. Return two lists: the scans with enough measured pixels, and one
+    text for each scan that has too few, with its name and the reason why it is left out.
 
     Raises:
         InputError: the store is of another printer, its prints were planned for another dataset, none of its
@@ -340,8 +340,8 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
     """Return the sources (printer, microscope) that remain possible after a test. ``printer`` states whether
-    the test points to the printer, and ``microscope`` whether it points to the microscope. If it points to
-    neither or to both, both sources remain possible.
+    the test points to the printer, and ``microscope`` states whether it points to the microscope. If the test
+    points to neither or to both, both sources remain possible.
     """
     return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 

@@ -112,7 +112,7 @@ def next_print(
 
     Raises:
         InputError: ``loop`` contains no closed loop on scans of heights, the layouts of the earlier prints
-            have only one level, there is no print or the prints are too small, or ``out`` contains a plan
+            have only one level, ``prints`` is below 1, ``field_um`` is too small, or ``out`` contains a plan
             with other settings.
     """
     folder = Path(loop)
