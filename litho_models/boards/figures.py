@@ -76,8 +76,8 @@ def counted(trials: Iterable[Trial]) -> list[Outcome]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """Compute the headline results. In a failed trial, no cause counts as found, and the corrected model
-    counts as one with too large an error.
+    """Compute the headline results. In a failed trial, no cause counts as found, and the error of the
+    corrected model counts as too large.
     """
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)

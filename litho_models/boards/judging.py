@@ -1,5 +1,5 @@
-"""Compare the causes that a loop names with the planted causes, and the error of its corrected model with the
-error of the true models.
+"""Compare the causes that a loop names with the planted causes. Also compare the error of its corrected model
+with the error of the true models.
 
 The rules for both comparisons were stated in docs/blind_trials.md before any board was run.
 """
@@ -32,8 +32,9 @@ _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Leave out findings about per-scan terms of the loop's catalogue, such as datum, bow or line offsets.
-    The default noise of the virtual fab adds such terms to every scan. Return the other findings.
+    """Return all findings except findings about per-scan terms of the loop's catalogue, such as datum, bow or
+    line offsets. These are left out because the default noise of the virtual fab adds such terms to every
+    scan.
     """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 

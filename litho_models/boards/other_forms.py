@@ -152,7 +152,7 @@ def _oriented_ringing(rng: Rng) -> Law:
 
 @_form("oriented-proximity", "dose", "1", 1.0)
 def _oriented_proximity(rng: Rng) -> Law:
-    """Dose spread over 4–8 µm along one direction, relative to the focused dose."""
+    """Dose that is spread over 4–8 µm along one direction, relative to the focused dose."""
     reach_um, direction = rng.uniform(4, 8), rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: _spread(
         dose, strength, np.exp(-2 * (np.pi * reach_um * _frequency_along(canvas, direction)) ** 2)
@@ -187,7 +187,7 @@ def _fast_axis_memory(rng: Rng) -> Law:
 
 @_form("crowding", "dose", "1", 4.0)
 def _crowding(rng: Rng) -> Law:
-    """Relative increase of the dose per cube of the dose averaged over 2.5–5 µm."""
+    """Relative increase of the dose, divided by the cube of a dose that is averaged over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
         dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
@@ -208,7 +208,7 @@ def _alternate_slices(rng: Rng) -> Law:
 
 @_form("focus-step", "dose", "µm", 2.0)
 def _focus_step(rng: Rng) -> Law:
-    """Blur (standard deviation) added to the spot in all prints after a random one near the middle of the
+    """Blur (standard deviation) added to the spot in all prints after a random print near the middle of the
     printing order.
     """
     first = rng.uniform(-0.25, 0.25)
@@ -250,7 +250,7 @@ def _lee_side_loss(rng: Rng) -> Law:
 
 @_form("plateau", "surface", "1", 1.0)
 def _plateau(rng: Rng) -> Law:
-    """Share of the height lost between two heights that are 0.15–0.25 µm apart; 1 makes a plateau."""
+    """Share of the height that is lost between two limits, 0.15–0.25 µm apart; 1 makes a plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
         surface - strength * np.clip(surface - lower_um, 0.0, width_um)

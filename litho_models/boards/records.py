@@ -157,8 +157,8 @@ class Answer(Result):
         found: causes, laws and descriptions.
         left: whether the residual has structure that the loop cannot explain.
         absorbed: names of effects that the loop cannot detect, because its base model can absorb them.
-        displaced_by: names of groupings, as in `Found.by`. The scans of each group have a displacement along
-            x in common.
+        displaced_by: names of groupings (as in `Found.by`) for which the loop found that the scans of each
+            group have a displacement along x in common.
         before_nm, after_nm: mean absolute error of the model without and with the findings, over the scans
             that are not locked. Each scan is predicted by a model that was fitted to other scans, and one
             offset is fitted to the scan before the error is computed. None if the loop does not state the
