@@ -53,9 +53,9 @@ Read = Callable[[], Array]
 class Coordinate:
     """The positions of the pixels along one dimension of an array.
 
-    ``values`` contains the positions, in ``unit``. If the file states only a length, ``values`` is None and
-    ``length`` contains this length. ``axis`` is the name of the axis, such as "x", if the attributes of the
-    positions state it. Otherwise it is empty.
+    ``values`` contains the positions, in ``unit``. If the file states only the length of the array along this
+    dimension, ``values`` is None and ``length`` contains this length. ``axis`` is the name of the axis, such
+    as "x", if the attributes of the positions state it. Otherwise it is empty.
     """
 
     values: Array | None
@@ -115,7 +115,8 @@ def array_channel(name: str, held: Held) -> Channel:
     """Make the channel of a two-dimensional array. The array is indexed [y, x] unless the names of its
     dimensions say otherwise.
 
-    In the channel, x grows to the right. Rows keep the order of the file, even if y decreases downwards.
+    In the channel, x grows to the right. The rows have the same order as in the file, whether y grows
+    downwards or upwards.
 
     Raises:
         InputError: the array has attributes that may scale its values in an unknown way (the message names
@@ -165,7 +166,7 @@ def array_channel(name: str, held: Held) -> Channel:
 
 
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
-    """Return the names of the dimensions along y and x, and True if the array's first index runs along x.
+    """Return the names of the dimensions along y and x, and whether the array's first index runs along x.
 
     If neither dimension has coordinates, the function looks for two coordinates named like x and y, such as
     "lon" and "lat". It returns their names if their lengths match the shape of the array.

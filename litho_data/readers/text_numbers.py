@@ -73,8 +73,8 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
     commas, and the text must not contain decimal points.
 
     Raises:
-        InputError: the text contains another separator in addition to commas, as in ``1,234.5;2,345.6``; the
-            commas may be either decimal commas or separators; or the commas may separate thousands.
+        InputError: numbers seem to contain thousands separators, as in ``1,234.5;2,345.6``, or commas seem to
+            be both decimal commas and separators.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
     for mark in "\t;,":  # remove a separator that stands at the end, or at the start, of every row

@@ -61,7 +61,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """Return the names, as used by SurfaceTopography, of the formats whose signature the file has."""
+    """Return the formats whose signature the file has, by the names that SurfaceTopography uses."""
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()

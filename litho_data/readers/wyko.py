@@ -24,7 +24,7 @@ def read_channels(path: Path) -> list[Channel]:
     wavelengths.
 
     A line of the file usually contains a column of the map, from bottom to top. If the numbers of lines and
-    cells fit only the opposite order, each line is read as a row of the map.
+    cells show that a line contains a row instead, each line is read as a row of the map.
 
     Raises:
         InputError: heights are in wavelengths but the header does not state the wavelength, or a block does
