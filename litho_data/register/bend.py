@@ -30,12 +30,13 @@ class Bend:
     The displacement is a polynomial of u and v. The coordinates u (along x) and v (along y) run from -1 to 1
     over the frame of the scan.
 
-    ``amount`` has shape (2, 3), with one row for the displacement along x and one for that along y. Its
-    columns are the coefficients of u² - 1/3, uv and v² - 1/3. For a scanner that creeps, ``amount`` has shape
-    (2, 11). Columns 3 to 10 are then the coefficients of the Legendre polynomials P₃(u), P₃(v), P₄(u), …
-    P₆(v). Over the frame, every term has a mean of zero and is orthogonal to u and v. The affine part of the
-    displacement, fitted over the frame, is therefore zero. ``middle`` and ``half`` contain the centre (x, y)
-    and half the size (x, y) of the frame, in the unit of ``amount``, so that u = (x - middle) / half.
+    ``amount`` has shape (2, 3), with one row for the displacement along x and one row for the displacement
+    along y. Its columns are the coefficients of u² - 1/3, uv and v² - 1/3. For a scanner that creeps,
+    ``amount`` has shape (2, 11). Columns 3 to 10 are then the coefficients of the Legendre polynomials P₃(u),
+    P₃(v), P₄(u), … P₆(v). Over the frame, every term has a mean of zero and is orthogonal to u and v. The
+    affine part of the displacement, fitted over the frame, is therefore zero. ``middle`` and ``half`` contain
+    the centre (x, y) and half the size (x, y) of the frame, in the unit of ``amount``, so that u = (x -
+    middle) / half.
     """
 
     amount: Array

@@ -1,5 +1,5 @@
-"""Estimate the uncertainty of a registration, from the errors in blocks held out of the fit, from a
-bootstrap, and from the correlation of scan and layout.
+"""Estimate the uncertainty of a registration. It is estimated from the errors in blocks that were left out of
+the fit, from a bootstrap, and from the correlation of scan and layout.
 """
 
 from dataclasses import dataclass

@@ -60,8 +60,8 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
     """Return the quality values that say how certain the warp is, and the shifts of the field's blocks.
 
-    The values are computed from blocks held out of the fit, from a bootstrap over the blocks, and from the
-    correlation of scan and layout at other shifts and in other orientations.
+    The values are computed from blocks that were left out of the fit, from a bootstrap over the blocks, and
+    from the correlation of scan and layout at other shifts and in other orientations.
     """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))

@@ -52,8 +52,8 @@ class Registration:
 
     ``bend_um`` describes how the scanner bent the scan, and is None for a scan that is not bent. For a bent
     scan, ``bend_um.straighten`` gives the true positions of points (x_um, y_um), and ``scan_to_layout`` maps
-    the true positions to the layout. Of all affine maps, this matrix is also closest to the complete map from
-    scan to layout, which includes the bend.
+    the true positions to the layout. The complete map from scan to layout includes the bend.
+    ``scan_to_layout`` is also the affine map that is closest to the complete map.
 
     ``defects`` is a bool array of shape (ny, nx) on the layout's pixels. It marks where the scan shows
     something other than the print, such as dust, or collapsed or lifted parts. It is None if nothing is
@@ -87,8 +87,8 @@ def register_scan(
         layout_pitch_um: pitch of the layout in µm.
         scan_pitch_um: pitch (y, x) of the scan in µm. It is needed if ``scan`` is an array.
         model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or ``homography``,
-            each of which contains the one before it. With ``ladder``, every kind is fitted, and the result is
-            the simplest kind that predicts held-out blocks as well as every later kind. With ``affine``,
+            each of which contains all kinds before it. With ``ladder``, every kind is fitted, and the result
+            is the simplest kind that predicts held-out blocks as well as every later kind. With ``affine``,
             ``homography`` and ``ladder``, a bend or creep may be fitted in addition (see
             ``Registration.bend_um``).
         fast_axis: the axis along which the tip moved fast. It is used only if the scan does not state it.

@@ -1,9 +1,9 @@
-"""Estimate the error of a registration's warp, and the quadratic surface that the heights contain in addition
-to the print.
+"""Estimate the quadratic surface that the heights of a registered scan contain in addition to the print, and
+the error of the registration's warp.
 
 Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
-The layout does not explain everything in the heights. If what it leaves unexplained differs from block to
-block, the spread of the fits includes the errors that this causes.
+Some structure in the heights does not follow from the layout and causes errors of the fits. If this structure
+differs from block to block, the spread of the fits includes these errors.
 """
 
 from dataclasses import dataclass
@@ -34,15 +34,15 @@ _MAGNIFICATION = 3
 
 @dataclass(frozen=True)
 class WarpError:
-    """The error of the warp between a scan and its layout, and the size and error of the quadratic surface
-    that the heights contain in addition to the print.
+    """The error of the warp between a scan and its layout. Also the quadratic surface that the heights
+    contain in addition to the print, with its error.
 
     Attributes:
         covariance: covariance matrix, of shape (k, k), of the coefficients of the warp's generators (see
             ``register.flows``), in the normalised frame of the layout.
         surface_rms: root mean square, over the field, of the quadratic surface without its offset, in the
             unit of the heights.
-        surface_error_rms: root mean square, over the field, of the error of that surface.
+        surface_error_rms: root mean square, over the field, of the error of this surface.
         is_clear: whether the surface is significant.
     """
 
@@ -90,8 +90,8 @@ class WarpError:
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
-    """Estimate the error of a registration's warp, and the quadratic surface that the heights contain in
-    addition to the print.
+    """Estimate the quadratic surface that registered heights contain in addition to the print, and the error
+    of the registration's warp.
 
     Args:
         height: registered heights, shape (ny, nx), NaN where not valid.
