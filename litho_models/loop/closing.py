@@ -127,7 +127,7 @@ class Closed:
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
-    """Find the effects that a base model lacks on these scans. Return the chosen base model and all effects
+    """Use the scans to find the effects that a base model lacks. Return the chosen base model and all effects
     that were added to it.
 
     Args:
@@ -184,7 +184,7 @@ def with_answer(
     Args:
         closed: the result.
         cause: the cause or law to replace, or None if the effect is added as a further cause.
-        name: name of the effect, which may be the cause itself.
+        name: name of the effect. It may be the name of the cause itself.
         values: starting values of the parameters of the effect.
         known: the fields ``alike``, ``excluded`` and ``role`` of the new `Cause`.
     """
@@ -277,7 +277,7 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
-    """Search for laws and then for tables that the model with the causes still lacks. Then check each cause
+    """Search for laws that the model with the causes still lacks, and then for tables. Then check each cause
     in a model that also contains the laws. If a table reduces the error more than all causes together, this
     model also contains the table.
 

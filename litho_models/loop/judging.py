@@ -39,7 +39,8 @@ SMALLEST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Judgement:
-    """The gain of a change of the model, which is the reduction of the squared error on held-out scans.
+    """The evidence for a change of the model. The gain is the reduction of the squared error on held-out
+    scans.
 
     Attributes:
         before_nm2: mean squared error before the change.

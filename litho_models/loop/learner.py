@@ -65,8 +65,8 @@ class Rest:
 
     @property
     def most_nm(self) -> float:
-        """Return an upper bound on the rms error that a wrong form of the model causes, nm. The bound is the
-        square root of the upper end of ``ci95_nm2``.
+        """Return an upper bound on the rms error that inexact formulas of the model cause, nm. The bound is
+        the square root of the upper end of ``ci95_nm2``.
         """
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))

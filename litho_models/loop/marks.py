@@ -29,7 +29,7 @@ def with_marks(
     maps_um: Sequence[np.ndarray],
     rounding_um: Sequence[float],
 ) -> list[ScanFinding]:
-    """Return the findings about per-scan terms together with those about marks.
+    """Return the findings about per-scan terms together with the findings about marks.
 
     Args:
         findings: the findings about per-scan terms. One of them is about the registration. The number of

@@ -30,8 +30,8 @@ _SAMPLED_PX = 16384
 
 @dataclass(frozen=True, repr=False)
 class ExposedScan(PrintedScan):
-    """A scan with its exposed layout. This is the nominal layout times ``exposure``, the relative dose of the
-    scan.
+    """A scan with its exposed layout. The exposed layout is the nominal layout times ``exposure``, the
+    relative dose of the scan.
     """
 
     exposure: float = 1.0
@@ -80,8 +80,8 @@ class PreparedScan:
 
     @cached_property
     def sample(self) -> np.ndarray:
-        """Return the flat indices of the n pixels that are used for fits and screening. They are a thinned
-        selection of the measured pixels away from the edge of the scan.
+        """Return the flat indices of the n pixels that are used for fits and screening. These pixels are a
+        part of the measured pixels, without the pixels near the edge of the scan.
         """
         return thinned(self._inner, _SAMPLED_PX)
 

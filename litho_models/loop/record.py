@@ -235,7 +235,7 @@ class Comparison(Record):
 
     ``better`` is the answer that fits better, and ``worse`` is the other answer. ``gain_nm2`` is the
     difference of their squared errors. ``z`` is this difference in standard deviations, after an allowance
-    for a wrong form of the model has been subtracted. ``difference_nm`` is the rms difference of the two
+    for inexact formulas of the model has been subtracted. ``difference_nm`` is the rms difference of the two
     predictions.
     """
 
