@@ -43,7 +43,7 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     of the squared errors is the squared distance between the two predictions. The actual difference varies
     about this value for two reasons. One reason is the noise, projected onto the difference of the
     predictions. The other reason is that the squared distance varies between prints, with the relative spread
-    ``question.spread``. An error of ``form_nm`` in the form of the model may explain a part of the
+    ``question.spread``. An error of ``form_nm`` in the formulas of the model may explain a part of the
     difference. This part is subtracted, as in the decision itself.
     """
     squares = prints * float(contrast.squares_um2.mean())
@@ -99,20 +99,20 @@ def surely_better(gain: float, difference: float, sd: float, form: float) -> flo
     allowance.
 
     Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose that
-    A is true except for noise n and an error e in the form of the model, which both rivals share. Prints then
-    show y = A + e + n, and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> -
-    2<D, n>. The noise averages out over prints, but e recurs in every print of similar texture. The angle
-    between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference of up to 2 |D| |e|
-    is inconclusive, and no number of prints separates rivals with |D| below 2 |e|. A second allowance is
-    derived from the new prints. Without e and without noise, the gain would be |D|². If the gain is smaller,
-    the part of the shortfall that noise does not explain also counts as an error of the model. The larger of
-    the two allowances is used.
+    A is true except for noise n and an error e in the formulas of the model, which both rivals share. Prints
+    then show y = A + e + n, and the difference of the two squared errors is
+    |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise averages out over prints, but e recurs in every
+    print of similar texture. The angle between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy and
+    Schwarz), a difference of up to 2 |D| |e| is inconclusive, and no number of prints separates rivals with
+    |D| below 2 |e|. A second allowance is derived from the new prints. Without e and without noise, the gain
+    would be |D|². If the gain is smaller, the part of the shortfall that noise does not explain also counts
+    as an error of the model. The larger of the two allowances is used.
 
     Args:
         gain: |y - B|² - |y - A|², where A is the rival that fits better.
         difference: |D|², the squared norm of the difference of the two predictions.
         sd: standard deviation that noise causes in the gain.
-        form: |e|², the squared norm of the error in the form of the model; 0 if it is unknown. All four
+        form: |e|², the squared norm of the error in the formulas of the model; 0 if it is unknown. All four
             arguments are computed over the same pixels and have the same unit.
     """
     if sd <= 0:

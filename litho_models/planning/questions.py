@@ -154,7 +154,7 @@ class Question(Record):
         rivals: the possible answers.
         spread: relative standard deviation, over scans, of the evidence for the effect, i.e. of the decrease
             of the squared error. The part that noise causes is not included.
-        form_nm: upper bound, nm, on the rms error that is due to a wrong form of the model; None if it is
+        form_nm: upper bound, nm, on the rms error that inexact formulas of the model cause; None if it is
             unknown. It is derived from the part of the residual that could still be learned. This is the
             residual of a model that assumes one of the answers.
         sizes: standard deviations of the parameters of a per-scan term over scans, keyed by the name of the

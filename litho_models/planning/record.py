@@ -57,8 +57,8 @@ class PlannedQuestion(Record):
     the rms difference between the predictions of the two most similar rivals (competing explanations) on the
     planned prints. ``random_difference_nm`` is the corresponding difference on the random layouts.
     ``prints_needed`` is the smallest number of prints with a power of at least 0.95. It is None if even the
-    largest number that was tried is too small. ``form_nm`` is an upper bound on the rms error that is due to
-    a wrong form of the model, or None if it is unknown.
+    largest number that was tried is too small. ``form_nm`` is an upper bound on the rms error that inexact
+    formulas of the model cause, or None if it is unknown.
     """
 
     name: str

@@ -210,8 +210,8 @@ class Rivalry:
         rounds: int = 1,
         first: Sequence[list[Linearised]] | None = None,
     ) -> list[EffectChain]:
-        """For each ordered pair of rivals, refit the second model to the prediction of the first. Return the
-        refitted models, one per pair, in the order of ``pairs``.
+        """For each ordered pair of rivals, refit the second model to the prediction of the first model.
+        Return the refitted models, one per pair, in the order of ``pairs``.
 
         Args:
             prints: planned prints. The refit is not differentiable with respect to the levels of these
