@@ -115,8 +115,8 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Return whether the error of the corrected model is within the tolerance for this kind of trial. If the
-    error is unknown, return False.
+    """Return whether the error of the corrected model is close enough to the error of the true models. The
+    limit depends on the kind of trial. If one of the errors is unknown, return False.
     """
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)

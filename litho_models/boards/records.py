@@ -83,7 +83,8 @@ class Planted(Record):
     Attributes:
         names: names in the loop's catalogue of effects that count as a right answer.
         strength: strength, in ``unit``.
-        at_limit: whether the strength is the largest allowed, because the drawn size could not be reached.
+        at_limit: whether the strength is the largest allowed strength, because the drawn size could not be
+            reached.
         rms_nm: size of the cause, nm. It is the rms of the residual in noise-free scans that contain only
             this cause, after the base model, the per-scan terms and the registration are refitted.
     """
