@@ -20,8 +20,8 @@ def read_channels(path: Path) -> list[Channel]:
     them.
 
     Raises:
-        InputError: the file is not a GSF file, its header lacks XRes or YRes or contains a scale of an
-            unknown kind, or the length of the data is wrong.
+        InputError: the file is not a GSF file, its header lacks XRes or YRes or contains a scale factor of
+            unknown meaning, or the length of the data is wrong.
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):

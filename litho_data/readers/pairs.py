@@ -4,7 +4,7 @@ pair of images for each.
 
 In an image of heights, the height of a pixel is its grey value, divided by 255 and multiplied by the full
 scale. The format cannot store negative heights, and it rounds heights to 256 values. The authors' files have
-no mask of valid pixels. This project adds one as a third image, in which pixels that were not measured are
+no mask of valid pixels. This project adds a mask as a third image, in which pixels that were not measured are
 black.
 """
 

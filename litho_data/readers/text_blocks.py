@@ -107,7 +107,7 @@ class Block:
         """Return the factor that converts the values to metres, or None if the header states no such factor.
 
         Raises:
-            InputError: the header gives a scale of an unknown kind.
+            InputError: the header contains a scale factor of unknown meaning.
         """
         if NUMBER.match(self.header.get(_TO_METRES, "")):
             return number(self.header[_TO_METRES])
@@ -136,10 +136,10 @@ class Block:
 
 
 def refuse_scales(header: Mapping[str, str]) -> None:
-    """Reject a header that contains a scale of unknown meaning.
+    """Reject a header that contains a scale factor of unknown meaning.
 
     Raises:
-        InputError: the header contains a scale of an unknown kind.
+        InputError: the header contains such a scale factor.
     """
     for key, value in header.items():
         if _SCALES.search(key.lower()) and NUMBER.match(value) and number(value) not in (0.0, 1.0):

@@ -134,8 +134,8 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
     offset.
 
     Raises:
-        InputError: ImageJ's calibration is not linear, or the page's description contains a scale of an
-            unknown kind.
+        InputError: ImageJ's calibration is not linear, or the page's description contains a scale factor of
+            unknown meaning.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:

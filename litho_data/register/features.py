@@ -26,7 +26,7 @@ class Correspondence:
     ``layout_points`` and ``scan_points`` contain the pixel indices (x, y) of the matched keypoints, in arrays
     of shape (n, 2). ``inlier`` says which matches agree with ``layout_to_scan`` within ``INLIER_PX``.
     ``hull_px2`` is the area, in layout pixels, of the convex hull of these inliers. ``keypoints`` is the
-    smaller of two numbers: the keypoints found in the layout, and the keypoints found in the scan.
+    number of keypoints found in the layout or the number found in the scan, whichever is smaller.
     """
 
     keypoints: int
