@@ -26,8 +26,8 @@ def scan_surface(
     """Return the heights, in µm, that the microscope reports for a surface.
 
     The fast axis is x, and the top line is scanned first. Lines run from left to right in trace, and from
-    right to left in retrace. The tip spends the same time on every pixel, whatever its size. In a scan with
-    smaller pixels, the time lag of the feedback therefore shifts the heights by a shorter distance.
+    right to left in retrace. The tip spends the same time on every pixel, whether the pixel is large or
+    small. The feedback lags by a fixed time, which is a shorter distance if the pixels are smaller.
 
     Args:
         surface_um: true heights at the pixels of the scan, in µm.
@@ -112,7 +112,7 @@ def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
 ) -> Array:
-    """Return the sum, in nm, of all contributions of the microscope that do not depend on the surface."""
+    """Return the sum, in nm, of all height errors of the microscope that do not depend on the surface."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
     pixels = noise.pixel_nm * rng.standard_normal(frame.shape)

@@ -1,5 +1,5 @@
 """Define the canvas, which is the area that is simulated: a layout and a guard frame around it. The module
-also computes blurs on the canvas, as products of spectra.
+also blurs arrays on the canvas, by multiplying their spectra.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ GUARD_PX = 96
 
 @dataclass(frozen=True)
 class Canvas:
-    """A layout with a guard frame around it, and its place in the write field.
+    """A layout with a guard frame around it. The canvas also states where the layout lies in the write field.
 
     Args:
         level: levels of the layout and its guard frame, a uint8 array of shape (ny + 2·GUARD_PX, nx +
@@ -82,7 +82,7 @@ def frequencies_per_um(shape: Shape, pitch_um: float) -> tuple[Array, Array]:
 
 
 def apply_transfer(field: Array, transfer: Array) -> Array:
-    """Return ``field`` after its spectrum (rfft2) was multiplied by ``transfer``."""
+    """Multiply the spectrum (rfft2) of ``field`` by ``transfer``, and return the filtered field."""
     return scipy.fft.irfft2(scipy.fft.rfft2(field) * transfer, s=field.shape)
 
 

@@ -87,7 +87,7 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Return the nominal dose of hatch lines that are written with errors of position. What belongs at x is
+    """Return the nominal dose of hatch lines with position errors. The dose that the layout places at x is
     written at x + strength·x(1 − x/L).
 
     The coordinate x runs from 0 to L, where L is the side of the write field.
@@ -114,8 +114,8 @@ def field_starts(size_px: int, side_px: int) -> list[int]:
 
 
 def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
-    """Return the nominal dose that results if every write field is displaced by its own offset. Where
-    displaced fields overlap, their doses add up.
+    """Displace every write field by its own offset, and return the resulting nominal dose. Where displaced
+    fields overlap, their doses add up.
 
     Args:
         nominal: nominal dose on the canvas.

@@ -17,8 +17,8 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A virtual fab: a printer, a microscope, their knobs (effects that can be added) and noise, and the seed
-    of all random draws.
+    """A virtual fab. It consists of a printer and a microscope, the knobs (effects that can be added) and the
+    noise of both, and the seed of all random draws.
 
     ``cause`` is an optional effect that you define yourself and that is not a knob.
     """
@@ -88,7 +88,7 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
 
 
 def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
-    """Return three seeds for the scan or print with the number ``index``. The first is for the scan's
-    position, the second for the roughness of the surface, and the third for the noise of the microscope.
+    """Return three seeds for the number ``index`` of a scan or a print. The first seed determines the scan's
+    position, the second the roughness of the surface, and the third the noise of the microscope.
     """
     return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

@@ -26,8 +26,9 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# First value: number of pixels along the side of a layout pixel, in the micrograph and in the image in which
-# edges are located. Second value: number of pixels by which the image with the edges is padded.
+# The first value is the number of fine pixels along the side of a layout pixel. The micrograph, and the image
+# in which edges are located, have these fine pixels. The second value is the number of fine pixels by which
+# the image with the edges is padded.
 _FINER, _AROUND = 4, 64
 # Width, in px, of the rim without film around a random layout.
 _RIM_PX = 12
@@ -138,8 +139,8 @@ FILM_PRINTERS = {
 class FilmTruth(Result):
     """The record ``films.json`` of simulated films.
 
-    For each film, the file ``<id>.npy`` in the same folder contains the signed distance of every point from
-    the film's edge, in layout pixels.
+    For each film, the file ``<id>.npy`` in the same folder contains signed distances from the film's edge, in
+    layout pixels, at 4 × 4 points in each pixel (see ``edge_distance_px``).
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"

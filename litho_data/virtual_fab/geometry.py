@@ -80,8 +80,8 @@ def place_scan(
 def sample_surface(
     surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
 ) -> Array:
-    """Interpolate a surface, which is given on the canvas, at the pixels of the scan. The result has the
-    shape ``frame.shape``.
+    """Interpolate a surface on the canvas at the pixels of the scan. The result has the shape
+    ``frame.shape``.
     """
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um

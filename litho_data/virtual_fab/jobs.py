@@ -1,5 +1,5 @@
-"""Make the jobs of a run, one for each field to print and scan. The layouts are random or come from a dataset
-card. Reference fields for a noise analysis can be added to random layouts.
+"""Make the jobs of a run. Each job describes one field to print and scan. The layouts are random or come from
+a dataset card. Reference fields for a noise analysis can be added to fields with random layouts.
 """
 
 import re
@@ -128,7 +128,8 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     """Make the jobs that print and scan the layouts of a dataset card.
 
     The columns ``turned_deg``, ``direction``, ``tip`` and ``pixel_size`` of the card's table may state how
-    each scan is made. Rows with the same print and the same layout are then scans of one printed field.
+    each scan is made. With these columns, rows with the same print and the same layout are scans of one
+    printed field.
 
     Args:
         path: path of the card.

@@ -28,15 +28,15 @@ class Knob:
         name: name of the knob on the command line and in the truth file.
         effect: name of the effect in the catalogue of effects, or `off-catalogue` if it is not listed there.
         stage: the stage of printing or scanning at which the effect acts.
-        role: the origin of the effect: the process or the measurement. ``nuisance`` marks an effect that no
-            process model can predict. ``undetermined`` means that the origin is not known.
+        role: what causes the effect, such as the process or the measurement. ``nuisance`` marks an effect
+            that no process model can predict. ``undetermined`` marks an effect whose cause is not known.
         unit: unit of the strength.
         limit: largest strength that is accepted.
         meaning: text that says what the strength means, and which properties are drawn at random.
         nuisance_span: True if a fit of offset, gain, plane and bow to each scan absorbs nearly all of the
             effect.
-        refit_absorbs: True if the plain model of printing imitates most of the effect when its parameters are
-            fitted again.
+        refit_absorbs: True if the plain model of printing, with its parameters fitted again, imitates most of
+            the effect.
     """
 
     name: str

@@ -26,7 +26,7 @@ class Job:
     Args:
         id: name of the scan.
         level: levels of the layout, uint8 of shape (ny, nx).
-        index: number of the scan in its set. The random draws for the scan depend on it.
+        index: number of the scan. The random draws for the scan depend on this number.
         order: position in the order of printing, from −0.5 (first) to 0.5 (last).
         dose: two-photon dose relative to the nominal dose.
         field_um: centre (y, x) of the layout in its write field, in µm from the write field's centre.
@@ -34,13 +34,13 @@ class Job:
         use: purpose of the scan. If it is ``substrate`` (a bare substrate) or ``grating`` (a calibration
             standard), nothing is printed.
         grating_um: period of the grating in µm.
-        print_index: number of the print in its set, for a print that is scanned more than once. With None, it
+        print_index: number of the print, for a print that is scanned more than once. With None, this number
             is equal to ``index``.
         turned_deg: rotation of the print under the microscope in degrees, a multiple of 90.
         direction: direction of the scan lines, 1 for trace and -1 for retrace.
         tip: number of the tip. Tip 1 is as blunt as the knobs state; every later tip is new and sharp.
         pixel_size: size of the scan's pixels, in pixels of the layout. The tip spends the same time on every
-            pixel, whatever its size.
+            pixel, whether the pixel is large or small.
     """
 
     id: str
@@ -66,8 +66,8 @@ class Job:
         return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Return the canvas of the field: the layout with its guard frame, and its place in the write
-        field.
+        """Return the canvas of the field, which is the layout with its guard frame and its position in the
+        write field.
         """
         side_um = self.write_field_um or max(self.level.shape) * pitch_um
         return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)
@@ -123,8 +123,8 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
 
 
 def _bars(at_um: Array, period_um: float) -> Array:
-    """Return the profile of a grating at the given positions. It is 1 on bars that are half a period wide,
-    and 0 between the bars. The flanks are straight lines.
+    """Return the profile of a grating at the given positions. The profile is 1 on the bars, which are half a
+    period wide, and 0 between them. The flanks of the bars are straight lines.
     """
     away_um = np.abs(at_um % period_um - period_um / 2)
     return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)

@@ -72,7 +72,7 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
 
 
 def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Apply the shrinkage that the knobs add to the shrinkage by drying, and return the heights."""
+    """Return the heights after the shrinkage that knobs cause. Plain drying has already shrunk ``height``."""
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
     if strength := knobs["dose-dependent-shrinkage"]:
@@ -89,8 +89,8 @@ def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, 
 
 
 def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Change narrow features and steep flanks as capillary forces and the developer do, and return the
-    heights.
+    """Return the heights after development. Capillary forces and the developer change narrow features and
+    steep flanks, as far as the knobs state.
     """
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:

@@ -19,15 +19,15 @@ class Printer:
         level_height_um: height of a slice.
         levels: number of levels. The highest column has ``levels - 1`` slices.
         spot_sigma_um: standard deviation of the *intensity* in the focus. Two-photon absorption is
-            proportional to the squared intensity, whose standard deviation is smaller by a factor of √2
-            (0.2 µm by default).
+            proportional to the squared intensity. The standard deviation of the squared intensity is smaller
+            by a factor of √2, and is 0.2 µm by default.
         threshold_dose: dose at which the conversion of the resist rises fastest, as a share of the full dose.
         threshold_steepness: steepness of the logistic curve of conversion against dose. The dose is in units
             of the full dose.
         network_reach_um: standard deviation of the Gaussian with which the conversion around a column is
             averaged. This mean determines how much the column shrinks.
-        loose_retention: share of its height that a column keeps if no resist around it is converted. If all
-            resist around it is converted, a column keeps its whole height.
+        loose_retention: share of the height that a column keeps when it dries, if no resist around it is
+            converted. If all resist around it is converted, a column keeps its whole height.
         base_um: height of the base layer's surface above the zero height of the scans.
         stitch_field_um: side of the write fields into which a larger layout is divided. The knob
             ``stitching`` displaces these fields.
@@ -85,9 +85,8 @@ class Microscope:
 class Noise:
     """The standard deviations, in nm, of the default noise, which is added without any knob.
 
-    On a flat print, the standard deviation of the total noise is the root of the sum of the squares of
-    ``roughness_nm``, ``line_nm`` and ``pixel_nm``. On a bare substrate, ``substrate_nm`` takes the place of
-    ``roughness_nm``.
+    On a flat print, the variance of the total noise is the sum of the squares of ``roughness_nm``,
+    ``line_nm`` and ``pixel_nm``. On a bare substrate, ``substrate_nm`` takes the place of ``roughness_nm``.
 
     Args:
         roughness_nm: roughness of printed surfaces, shaped like hatch lines.

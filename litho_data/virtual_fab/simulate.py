@@ -50,9 +50,9 @@ def simulate(
     ``out/raw/card.toml``.
 
     The folder ``out/raw`` contains what a laboratory would deliver: the card, its table, the layouts and the
-    scans. The folder ``out/truth`` contains what only a simulation knows: the record ``truth.json``, and the
-    heights of every print, once without and once with roughness. Scans are made one at a time, so the memory
-    that is used does not grow with the number of scans.
+    scans. The folder ``out/truth`` contains what is known only in a simulation. It holds the record
+    ``truth.json`` and the heights of every print, once without and once with roughness. Scans are made one at
+    a time, so the memory that is used does not grow with the number of scans.
 
     Args:
         out: folder of the run.
@@ -210,8 +210,8 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]], sizes_um: list[YX]) -> None:
-    """Write the card's table. The columns SCANNING are left out if all scans have the usual values in them.
-    The sizes (y, x) of the scans are left out if all scans have the same size.
+    """Write the card's table. If all scans have the usual values in the columns SCANNING, these columns are
+    left out. If all scans have the same size (y, x), the sizes are left out.
     """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)

@@ -48,8 +48,9 @@ def strength_for_rms(
     Args:
         name: name of the knob.
         rms_nm: wanted rms change of the scans in nm.
-        jobs: the fields on which the change is measured. By default, they are four random layouts of 256 ×
-            256 px, two at each of the two cut-off frequencies that random layouts use.
+        jobs: the fields on which the change is measured. By default, they are four fields of 256 × 256 px
+            with random layouts. Two of the layouts have coarse features (low cut-off frequency), and two have
+            fine features (high cut-off frequency).
         seed: seed of the knob.
 
     Raises:
@@ -119,8 +120,8 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
     The per-scan terms are offset, gain, plane and bow: {1, P, x, y, x², xy, y²}, where P is the scan without
     the knob. They are fitted to the change of each scan by least squares and subtracted. The pixels of the
-    scans coincide with those of the layout. For a knob that displaces the scan, the change is therefore the
-    difference of the heights at the same pixel.
+    scans coincide with those of the layout. If a knob displaces the scan, the displacement is not corrected.
+    The heights are compared at the same pixel.
     """
     mean_squares = []
     for job in jobs:
@@ -142,8 +143,9 @@ def _free_of_nuisances(change: Array, prediction: Array) -> Array:
 
 
 def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
-    """Return four random fields of 256 × 256 px, evenly spaced in the order of printing. There are two fields
-    for each of the two cut-off frequencies.
+    """Return four fields of 256 × 256 px with random layouts, evenly spaced in the order of printing. Two of
+    the layouts have coarse features (low cut-off frequency), and two have fine features (high cut-off
+    frequency).
     """
     return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
 

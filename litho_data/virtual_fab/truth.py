@@ -1,5 +1,5 @@
 """Define the record of the truth about a simulated run. It contains the knobs of the run, the positions of
-its scans, and the noise in the scans. The build of a dataset from the run must not read this record.
+the scans, and the noise in the scans. When a dataset is built from the run, this record must not be read.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: Array) -> dict[str, float]:
-    """Return the offset of the noise in one scan, and the mean absolute value and the root mean square of the
-    noise, in nm.
+    """Return the mean (offset), the mean absolute value and the root mean square of the noise in one scan, in
+    nm.
 
     For the values ``floor_full_mae_nm`` and ``floor_full_rmse_nm``, offset, tilt and bow are removed from the
     noise. For ``floor_mae_nm`` and ``floor_rmse_nm``, only the offset is removed.
