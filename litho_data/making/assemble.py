@@ -1,5 +1,5 @@
-"""Complete a store to which all finished scans have been written. The samples, tables, manifest, attributes
-and hashes are added.
+"""Complete a store to which all finished scans have been written. The module adds the arrays on the layout's
+grid, the tables, the manifest, the attributes and the hashes.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ IMAGES = "o"
 class Source:
     """Everything from which a store is made.
 
-    ``files`` contains, for each id, a mapping from the recorded names of its raw files to their paths.
-    ``standards`` maps the recorded names of the calibration standards' raw files to their paths. ``recipe``
-    is the levelling recipe in canonical form. ``assumptions`` lists the assumptions that were made because
-    the card does not state a value. ``unpaired`` maps every id that lacks a scan or a layout to the reason,
-    and ``refused`` maps every id with an unusable file to the reason.
+    ``files`` contains, for each id, a mapping from the recorded names of its raw files to their paths. A
+    recorded name is the path below the data folder. ``standards`` maps the recorded names of the calibration
+    standards' raw files to their paths. ``recipe`` is the levelling recipe in canonical form. ``assumptions``
+    lists the assumptions that were made because the card does not state a value. ``unpaired`` maps every id
+    that lacks a scan or a layout to the reason, and ``refused`` maps every id with an unusable file to the
+    reason.
     """
 
     card: Card
@@ -98,7 +99,7 @@ def records_of_use(records: Sequence[Facts]) -> list[Facts]:
 
 
 def facts_of_card(card: Card) -> dict[str, Any]:
-    """Return the facts that a card states about all its scans. They are part of the dataset's hash."""
+    """Return those values of a card that hold for all its scans. The dataset's hash includes these values."""
     write = card.write.model_dump(exclude_none=True) if card.write else None
     return dataset_facts(card.layout, card.scan.instrument, write)
 
@@ -148,8 +149,8 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
 
 
 def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return the table of the registrations' quality values, with one row per scan of the dataset. A value
-    that could not be computed is NaN.
+    """Return a table that states how well each scan of the dataset was registered, with one row per scan. A
+    value that could not be computed is NaN.
     """
     import pandas as pd
 
@@ -185,8 +186,8 @@ def provenance_table(records: Sequence[Facts]) -> pd.DataFrame:
 
 
 def table_sha256(table: pd.DataFrame) -> str:
-    """Return the hash of a table's column names and values. The column ``software`` is left out, because it
-    differs between installations.
+    """Return the hash of a table's column names and values. The hash does not cover the column ``software``,
+    which differs between installations.
     """
     columns = {}
     for name in sorted(str(column) for column in table.columns if column != "software"):
@@ -220,8 +221,8 @@ def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[s
     """Return the table of files, with one row per raw file, sorted by id.
 
     Args:
-        source: everything from which the records were made. The raw files and the ids that lack a scan or a
-            layout are taken from it.
+        source: everything from which the records were made. It states the raw files, and the ids that lack a
+            scan or a layout.
         records: records of the finished scans, keyed by the id of the scan.
         skipped: reasons why scans are not in the store, keyed by the id of the scan.
 

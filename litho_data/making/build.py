@@ -51,14 +51,14 @@ def build_dataset(
 
     Each scan is read, levelled by the card's recipe, registered, and resampled once onto the grid of its
     layout. A scan that cannot be used is skipped. The reason is printed on stderr and recorded in the
-    manifest. The store is put in place only when it is complete, and an interrupted build continues when it
-    is run again. The report is written to ``<name>-report`` beside the store.
+    manifest. The store appears at ``out`` only when it is complete. If a build is interrupted, running it
+    again continues it. The report is written to ``<name>-report`` beside the store.
 
     Args:
         card_path: path of the dataset card.
         out: folder of the store. An older store there is replaced.
-        data_dir: folder of the raw files. By default, it is the card's folder, ``$LITHO_DATA_DIR/<name>`` or
-            the user cache, whichever contains the files.
+        data_dir: folder of the raw files. By default, it is the first of these folders that contains the
+            files: the card's folder, ``$LITHO_DATA_DIR/<name>``, the user cache.
         workers: number of local processes.
         dask: address of a Dask scheduler, which is used in place of local processes. The store is the same
             either way.
@@ -69,8 +69,8 @@ def build_dataset(
 
     Raises:
         InputError: the card is bad, no scan is usable, ``tip`` is neither a radius nor ``blind``, or ``out``
-            contains something other than a store. If ``strict`` is true, the error is also raised if an id
-            has no usable scan or no usable layout.
+            contains something other than a store. With ``strict``, the error is also raised if any id lacks a
+            usable scan or a usable layout.
     """
     listing = list_fields(card_path, data_dir)
     if tip is not None:
@@ -110,9 +110,7 @@ def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> 
 
 
 def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
-    """Run the jobs of a source, and write the store and its report. The docstring of ``build_dataset``
-    describes how.
-    """
+    """Run the jobs of a source, and write the store and its report (see ``build_dataset``)."""
     started, clock = datetime.now(UTC), time.perf_counter()
     with partial_store(out) as partial:
         root = partial.open()
@@ -205,10 +203,9 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """Find out whether the scans that could not be registered show the layout of another id.
-
-    If a scan does, the id of this layout is added to the reason in ``skipped``. The result maps the ids of
-    these scans to messages that name the layout.
+    """Test whether any scan that could not be registered shows the layout of another id. If it does, the id
+    of this layout is added to the scan's reason in ``skipped``. The result maps the ids of such scans to
+    messages that name the layout.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
@@ -233,9 +230,9 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], jobs: Sequence[Job]) -> dict[str, str]:
-    """Find the scans whose pixels differ in aspect ratio from the pixels of most scans. The result maps the
-    ids of these scans to the reason for leaving them out. Reference scans, and scans whose size is stated by
-    their own file or by the card's table, are not compared.
+    """Find the scans whose pixels have another aspect ratio than in most scans. The result maps the ids of
+    these scans to the reason for leaving them out. Reference scans, and scans whose size is stated by their
+    own file or by the card's table, are not compared.
 
     A text file that lacks its last rows can still be read as a matrix. Its pixels then seem too long along y,
     because the side length that the card states for all scans is divided by too few rows.

@@ -24,8 +24,8 @@ _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """Return the scales with which a build of the card would correct lengths and heights. The keys are the
-    axes ``y``, ``x`` and ``z``. Axes for which the card names no calibration standard are left out.
+    """Return the scales with which a build of the card would correct lengths and heights. The keys are those
+    of the axes ``y``, ``x`` and ``z`` for which the card names a calibration standard.
 
     Raises:
         InputError: the card has no table ``[calibration]``, a file is missing, or a scan does not show its
@@ -113,18 +113,18 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def defaults_beside(own: Collection[str]) -> list[str]:
-    """Return which of the arguments ``unit`` and ``size_um`` of ``read_scan`` are mere defaults, so that a
-    value in the file of a scan takes precedence. An argument is a mere default if the card states it for all
-    scans together.
+    """Return those of the arguments ``unit`` and ``size_um`` of ``read_scan`` that the card states only for
+    all scans together. If the file of a scan states another value for one of these arguments, the file takes
+    precedence.
 
-    ``own`` contains the names of the values that the card or its table states for one scan alone. They are
-    not returned, because the file of this scan must agree with them.
+    ``own`` contains the names of the arguments that the card or its table states for this scan alone. The
+    file of the scan must agree with their values, so these names are not returned.
     """
     return [name for name in ("unit", "size_um") if name not in own]
 
 
 def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:
-    """Return the scale factor of every axis and the standard uncertainty of this factor. The result has shape
+    """Return the scale factor of every axis and the standard uncertainty of each factor. The result has shape
     (3, 2).
 
     The rows are in the order of ``SCALES``. An axis without a standard has the factor 1 and the uncertainty

@@ -61,8 +61,8 @@ class Chain:
         return [one * self.scales.get(f"scale_{axis}", 1.0) for axis, one in axes]
 
     def piece(self, **said: Any) -> Piece:
-        """Return the part of the store that the operations made. ``said`` contains the entries of the scan's
-        record other than ``steps`` and ``software``.
+        """Return the finished scan that the operations made. Its record contains the entries ``said``, to
+        which ``steps`` and ``software`` are added.
         """
         steps = [step.to_record() for step in self.steps]
         record = {**said, "steps": steps, "software": software_record()}

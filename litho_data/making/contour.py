@@ -26,8 +26,8 @@ _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
-# An island or a gap of the layout counts as lost in printing if at most this share of its area was printed as
-# the layout states.
+# An island or a gap counts as lost in printing if at most this share of its area was printed as in the
+# layout.
 _LOST = 0.1
 
 
@@ -36,8 +36,8 @@ class Edges(NamedTuple):
 
     ``distance_px`` has the shape (ny, nx) of the micrograph. It contains the signed distance of each pixel
     from the nearest edge, positive on the film. ``specks`` is a bool mask of the same shape. It marks dots
-    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of an edge
-    position that is determined from a single pixel.
+    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of the edge
+    position if it is determined from a single pixel.
     """
 
     distance_px: Array
@@ -110,7 +110,7 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
 
 def edge_shift_px(level: Array, distance_px: Array) -> float:
     """Return the median distance, in pixels, by which the edges of a film lie outside the edges of its
-    layout. The result is negative if they lie inside.
+    layout. The result is negative if the film's edges lie inside.
 
     In a layout of small islands and gaps, a registration would mistake part of such a shift for a change of
     scale. The registration must therefore use a layout whose edges are shifted in the same way. A shift of
@@ -152,8 +152,8 @@ def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
     """Return a bool mask of the defects in a print: film (dirt) far inside a gap of the layout, or bare
     ground (a pit) far inside the layout's film.
 
-    A gap that is completely closed, or an island that is completely missing, belongs to the print and is not
-    a defect.
+    If a gap is completely closed or an island is completely missing, this is a property of the print. It is
+    not marked as a defect.
 
     Args:
         covered: measured share of each pixel that film covers, shape (ny, nx), NaN where not measured.

@@ -41,8 +41,8 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """Estimate the radius of the tip from one scan, or return None if the scan cannot be read. If there are
-    calibration standards, calibrated lengths are used.
+    """Estimate the radius of the tip from one scan, or return None if the scan cannot be read. If the card
+    names calibration standards, the radius is computed with calibrated lengths.
     """
     try:
         chain = job.begin()

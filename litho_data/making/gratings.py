@@ -19,8 +19,8 @@ class GratingScan(Record):
     Args:
         period_um: known period of the grating.
         line_um: length of a scan line.
-        scale_x, scale_y: factors by which lengths in the scan, along x and y, are multiplied to give true
-            lengths. ``scale_x_sd`` and ``scale_y_sd`` are their standard uncertainties.
+        scale_x, scale_y: factors that convert lengths in the scan, along x and y, to true lengths.
+            ``scale_x_sd`` and ``scale_y_sd`` are their standard uncertainties.
         bow_um: displacement along x of the middle of a scan line relative to its ends. ``bow_sd_um`` is its
             standard uncertainty.
         tip_at_most_um: upper bound on the radius of the tip. The bound does not hold for a tip that is too

@@ -27,7 +27,7 @@ def height_sigma(
 ) -> tuple[Array, Mapping[str, float]]:
     """Return the standard uncertainty of registered heights, without the uncertainty of the scan's offset.
 
-    The variance is the sum of six parts. Their causes are:
+    The variance is the sum of six parts, each with its own cause:
 
     - ``pixel``: noise that is independent from pixel to pixel, as far as it remains after resampling;
     - ``line``: offsets that are independent from scan line to scan line, as far as they remain after
@@ -46,15 +46,16 @@ def height_sigma(
         blur_px, model: results of the registration: the sigma of the blur, in layout pixels, and the kind of
             warp, as in ``warp_error``.
         levelled: whether a levelling recipe was applied. If so, the part ``levelling`` includes an estimate
-            of the surface that the recipe wrongly removed from the print. If not, this part is only the
-            quadratic surface that does not belong to the print, and 0 if this surface is not significant.
+            of the surface that the recipe wrongly removed from the print. If not, this part is the mean
+            square of the quadratic surface by which the heights differ from the print. It is 0 if this
+            surface is not significant.
         fast_axis: the axis along which the tip moved fast.
         z_uncertainty: relative uncertainty of the z scale; 0 if the z scale was not calibrated.
 
     Returns:
-        The uncertainty in µm as float32 on the layout's grid, NaN where not valid; and a mapping with root
-        mean squares over the scan, in nm. The mapping has the key ``sigma_<part>_nm`` for each part, and the
-        key ``sigma_nm`` for the total uncertainty.
+        Two items: the uncertainty in µm as float32 on the layout's grid, NaN where not valid; and its root
+        mean squares over the scan, in nm, in a mapping. The key ``sigma_<part>_nm`` stands for one part, and
+        the key ``sigma_nm`` for the total uncertainty.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape

@@ -200,9 +200,10 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """Return the parameters that describe the grid of the layout. If the card states that the field's
-        surroundings are unknown or continue the print, the heights at the border depend on them and become
-        invalid. ``edge_px`` is then the width of this border in pixels.
+        """Return the parameters that describe the grid of the layout. If the card states that the
+        surroundings of the field are unknown or belong to the print, the heights at the border depend on
+        surroundings that the layout does not show. They become invalid, and ``edge_px`` is the width of this
+        border in pixels.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)
@@ -260,8 +261,8 @@ class FieldJob:
 
 
 def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
-    """Return the steps with which a reference scan is levelled. They are the steps of the recipe except
-    layout-aware ones, because no layout can be located in a reference scan.
+    """Return the steps with which a reference scan is levelled. They are the steps of the recipe that do not
+    use the layout, because no layout can be located in a reference scan.
 
     In scans of a flat surface, polynomial steps of the same degrees replace the layout-aware steps. In scans
     of steps and gratings, nothing replaces them, because polynomials would remove part of the structure.
@@ -277,8 +278,8 @@ def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
 
 
 def _own_reader(scan: Path, format: str) -> dict[str, str]:
-    """Return the parameter that identifies the reader of a scan if the user wrote this reader. For a reader
-    of this package, the result is empty.
+    """If the user wrote the reader of a scan, return the parameter that identifies this reader. For a reader
+    of this package, return an empty dict.
     """
     sha256 = own_reader_sha256(scan, format)
     return {READER_SHA256: sha256} if sha256 else {}

@@ -128,7 +128,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the edges of the film, and convert them to a height map. Another operation registers this map."""
+    """Find the edges of the film, and make a height map from them, which another operation registers."""
     from litho_data.making.contour import REACH_PX, coverage, find_edges
 
     edges = find_edges(arrays["micrograph"], params.get("reach_px", REACH_PX))
@@ -198,7 +198,8 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs these levels.
 
-    The levels are also NaN at defects, so that no background is fitted to dust.
+    The levels are NaN outside the layout. They are also NaN at defects, so that no background is fitted to
+    dust.
     """
     from litho_data.level import layout_in_scan_frame
 

@@ -1,4 +1,4 @@
-"""Write the report of a build, with its inputs, its results and pictures of the scans."""
+"""Write the report of a build. It shows the inputs, the results and pictures of the scans."""
 
 from __future__ import annotations
 

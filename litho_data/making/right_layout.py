@@ -27,7 +27,7 @@ _EDGE_PX = 2
 _BETTER = 0.02
 # An unregistered scan is said to show a layout if its correlation with this layout is at least the first
 # value, and exceeds the correlation with every other layout by more than the second value. At the best shift,
-# the correlation of a print with its own layout is about 0.9, and with another layout 0.3 to 0.5.
+# a print has a correlation of about 0.9 with its own layout, and of 0.3 to 0.5 with another layout.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
 # Standard deviation, from scan to scan, of the logarithm of the height per level at one dose. The first value
@@ -41,11 +41,11 @@ class Print:
     """One registered scan. Its heights and its blurred layout are sampled at a few points.
 
     ``response`` contains the height per level in µm, and the relative growth of this height with the dose.
-    ``edge_times`` compares the deviations of the heights from the blurred layout: it is the rms deviation of
-    the outermost pixels divided by the rms deviation of the inner pixels. ``dihedral`` is the orientation
-    that the registration found, and ``turned`` is true if the card states that the print was rotated under
-    the microscope. Scans in the same ``group`` should have the same height per level. The group is the dose
-    if the card states it, and the print otherwise.
+    ``edge_times`` is the rms deviation of the heights from the blurred layout at the outermost pixels,
+    divided by the rms deviation at the inner pixels. ``dihedral`` is the orientation that the registration
+    found, and ``turned`` is true if the card states that the print was rotated under the microscope. Scans in
+    the same ``group`` should have the same height per level. The group is the dose if the card states it, and
+    the print otherwise.
     """
 
     id: str
@@ -178,8 +178,8 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Yield the id and a message for every scan that seems to belong to another group (dose or print). The
-    height per level of such a scan differs clearly from the height per level of its own group, and is closest
-    to that of another group. Scans whose doses seem to be swapped are yielded too.
+    height per level of such a scan differs clearly from the value of its own group, and is closest to the
+    value of another group. Scans whose doses seem to be swapped are yielded too.
     """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
@@ -217,10 +217,10 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
     relative growth of this slope with the dose, d ln slope / d ln dose.
 
-    The exposure is the level times the dose. The curve g(T) of the heights against the blurred levels T
-    therefore determines how a larger dose changes the slope. The growth is cov(T, T g') / cov(T, g). Here, g
-    is a fitted parabola, so the growth is one plus the share of the slope that comes from the quadratic term.
-    In a saturated print, the growth is negative.
+    The exposure is the level times the dose. Let g(T) be the heights as a function of the blurred levels T. A
+    larger dose stretches this curve, so the growth is cov(T, T g') / cov(T, g). Here, g is a fitted parabola,
+    and the growth is one plus the share of the slope that comes from the quadratic term. This share is
+    negative if the print saturates, and the growth may then be negative too.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)
@@ -249,8 +249,8 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Return messages for the doses that seem to be swapped, keyed by dose. If no dose has a clearly smaller
-    height per level than a smaller dose, the result is empty.
+    """Return messages for the doses that seem to be swapped, keyed by dose. Doses seem to be swapped if the
+    height per level clearly falls from a smaller to a larger dose. If it falls nowhere, the result is empty.
 
     Args:
         rising: for each dose, the median logarithm of the height per level and the number of scans. It

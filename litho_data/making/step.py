@@ -1,5 +1,5 @@
-"""Run and record a single step of a build. The record states the origin of the step's arrays, so that they
-can be reproduced.
+"""Run and record a single step of a build. The record states how the step made its arrays, so that they can
+be reproduced.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ class Operation:
 
     Args:
         name: name of the operation in the records.
-        version: version of the operation. A change of the function that may change its results gets a new
-            version.
+        version: version of the operation. If a change of the function may change its results, the version is
+            changed too.
         function: function ``function(params, files, arrays)`` that returns a mapping from names to arrays,
             and a mapping of facts.
         takes: names of the input arrays, in the order in which they are recorded. Arrays that a scan does not
@@ -144,7 +144,7 @@ def _one_thread() -> Iterator[None]:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """Return the control of the numerical libraries' threads. The control is cached, because finding the
+    """Return an object that limits the threads of the numerical libraries. It is cached, because finding the
     libraries takes 10 ms.
     """
     import scipy.linalg  # noqa: F401 - SciPy has its own BLAS, which can be limited only once it is loaded

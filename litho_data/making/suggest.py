@@ -67,9 +67,10 @@ _PROCESS = re.compile(r"^[ \t]*\[[ \t]*process[ \t]*\][ \t]*(#.*)?$", re.MULTILI
 class Suggestion:
     """The suggested recipe, and the residuals of all recipes in nm.
 
-    ``left_nm[recipe][scan]`` is the root mean square of the residual. The residual is the part of the
-    levelled heights that the layout does not explain. It is computed in blocks that were held out of the fit.
-    ``warned`` maps recipes to the warnings about them. ``card`` is the path of the card that was written.
+    ``left_nm[recipe][scan]`` is the root mean square of the residual, which is the part of the levelled
+    heights that the layout does not explain. The residual is computed in blocks that were held out of the
+    fit. ``warned`` maps recipes to the warnings about them. ``card`` is the path of the card that was
+    written.
     """
 
     recipe: str
@@ -229,7 +230,7 @@ def _write_card(card: Path, best: str) -> Path:
 
 
 def _says(text: str, content: Mapping[str, Any]) -> bool:
-    """Return whether a text is TOML with this content."""
+    """Return whether a text is valid TOML and has the given content."""
     try:
         return tomllib.loads(text) == content
     except tomllib.TOMLDecodeError:

@@ -11,14 +11,15 @@ from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
 ALL = "all scans"
-# Limits of the height per level. If the height per level of the prints differs from that in the card by more
-# than the first factor, this is reported. If it differs by more than the second factor, nothing is built. A
-# scan is left out if its height per level differs from that of the other scans by more than the third factor.
+# Limits of the height per level. If the height per level of the prints differs from the level height in the
+# card by more than the first factor, this is reported. If it differs by more than the second factor, nothing
+# is built. A scan is left out if its height per level differs from the median over the scans by more than the
+# third factor.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
-# Limits of the scale of a scan on its layout. If the scales differ from 1 by more than the first value, but
-# from each other by less than the second value, the pitch in the card is probably wrong. If the scale of a
-# single scan differs from that of the other scans by more than the third value, the size of this scan is
-# probably wrong.
+# Limits of the scale factor from a scan to its layout. If the factors differ from 1 by more than the first
+# value, but from each other by less than the second value, the pitch in the card is probably wrong. If the
+# factor of a single scan differs from those of the other scans by more than the third value, the size of this
+# scan is probably wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
 # Largest accepted value of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints
@@ -55,8 +56,8 @@ class Finding(Record):
 
 
 def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
-    """Find scans whose height per level differs greatly from that of the other scans. The result maps the ids
-    of these scans to the reason for leaving them out.
+    """Find scans whose height per level differs greatly from the median over all scans. The result maps the
+    ids of these scans to the reason for leaving them out.
     """
     gains = {one.id: abs(one.response[0]) for one in prints}
     if len(gains) < 3:
@@ -71,8 +72,8 @@ def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
 
 
 def require_heights(prints: Sequence[Print], card: Card) -> None:
-    """Reject a card whose level height is far from the measured one, for example because the card states a
-    wavelength in nm.
+    """Reject a card whose level height is far from the measured height per level. For example, the card may
+    state the level height in nm instead of µm.
 
     Raises:
         InputError: the height per level of the prints is more than 100 times the level height in the card, or
@@ -143,9 +144,9 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
 def _of_the_card(
     records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Yield contradictions between the measured scans and the numbers in the card.
+    """Find where the measured scans contradict the numbers in the card.
 
-    Each contradiction consists of the id of the scan that it concerns (or "all scans"), a text and a weight.
+    For each contradiction, yield the id of the scan that it concerns (or "all scans"), a text and a weight.
     """
     layout = card.layout
     times = _height_times(prints, card)
