@@ -1,5 +1,5 @@
-"""Rules for commands that write their result as a folder: how they declare, begin, continue and finish this
-result.
+"""Rules for commands that write their result as a folder. The rules state how a command declares, begins,
+continues and finishes this result.
 
 A command first declares two things: the name of its record file, which it writes last, and the fields of
 this record that determine the result. The folder is then in one of four states:
@@ -59,13 +59,13 @@ def growing_folder(
             this file last.
         facts: fields of the record that determine the result. A folder whose record has other values of these
             fields is refused.
-        holds: pattern of the names of files that the folder may contain before the result is begun, such as
-            designs that were made one by one.
+        holds: pattern of file names. Files with such names, such as designs that were made one by one, may be
+            in the folder before the result is begun.
 
     Raises:
         InputError: ``out`` is a file, cannot be written, or is being written by another process. The error is
             also raised if ``out`` contains something other than this result, such as a result of this kind
-            with other ``facts``. It is raised before the ``with`` block begins.
+            with other ``facts``. All these errors are raised before the ``with`` block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)
@@ -116,8 +116,8 @@ def whole_folder(
 
 
 def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
-    """Return whether the same result was begun in this folder but not finished; raise InputError if the
-    folder contains anything that this result must not replace.
+    """Return whether this result was begun in the folder but not finished. Raise InputError if the folder
+    contains anything that this result must not replace.
     """
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record

@@ -16,8 +16,8 @@ class InputError(ValueError):
     and may add a hint.
 
     The command lines print the message without a traceback and exit with code 2; every other exception is a
-    defect of this project. If ``got`` is an exception, the message states in plain words what caused that
-    exception.
+    defect of this project. If ``got`` is an exception, the message states the cause of this exception in
+    plain words.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):
@@ -42,9 +42,8 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Raise an InputError which says that a file is damaged, if the content of the file causes an error in
-    the ``with`` block. Use this function for files that a program wrote and that somebody may have edited
-    later.
+    """If the content of a file causes an error in the ``with`` block, raise an InputError which says that the
+    file is damaged. Use this function for files that a program wrote and that somebody may have edited later.
 
     Raises:
         InputError: the content of the file causes an error, such as a missing key, text instead of a number,

@@ -20,8 +20,8 @@ _SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 
 
 def let_waiting_threads_sleep() -> None:
-    """Make torch's threads sleep while they wait for one another; by default, they keep a processor busy
-    (they spin). Call this before torch is loaded.
+    """Make torch's threads sleep while they wait for one another. By default, waiting threads spin, i.e. they
+    keep a processor busy. Call this before torch is loaded.
 
     If another process keeps a processor busy, a computation with two spinning threads takes ten times as
     long. Environment variables that are already set are not changed.
@@ -43,8 +43,8 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
             __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
 
     Args:
-        package: ``__name__`` of the package. No public name may equal the name of a subpackage or module of
-            the package, because importing the subpackage or module would bind that name to it.
+        package: ``__name__`` of the package. No public name may equal the name of a module or subpackage of
+            the package. Importing this module would otherwise replace the public name.
         file: the package's ``__init__`` file; every name that it imports with ``as`` is public.
 
     ``__version__`` is always among the public names. It is the version of the distribution, or ``"0"`` if the
@@ -82,8 +82,8 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
 
 
 def require_extra(command: str, extra: str) -> None:
-    """End a command with one line on stderr and exit code 2 if it needs optional packages that are not
-    installed. ``extra`` is the name under which pip installs these packages.
+    """If a command needs optional packages that are not installed, end it with one line on stderr and exit
+    code 2. ``extra`` is the name under which pip installs these packages.
     """
     let_waiting_threads_sleep()
     if importlib.util.find_spec(_OF_EXTRAS) is None:

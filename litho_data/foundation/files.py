@@ -207,7 +207,7 @@ def table_beside(module: str, name: str) -> dict[str, Any]:
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """Turn file-system errors into InputErrors while the first files of an output are written."""
+    """Convert file-system errors to InputErrors. Use this while the first files of an output are written."""
     try:
         yield
     except OSError as error:

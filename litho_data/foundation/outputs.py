@@ -1,8 +1,8 @@
 """Rules for the option ``--out`` of every command: a command replaces only its own older result.
 
-A missing or empty folder is accepted. The folder of an earlier run is accepted if the same command was run on
-the same dataset, model or design with the same settings; the run is then resumed or repeated. Anything else
-is refused, and nothing is changed.
+A missing or empty folder is accepted. The folder of an earlier run is accepted if the command, the dataset,
+model or design, and the settings are the same. The run is then resumed or repeated. Anything else is refused,
+and nothing is changed.
 """
 
 import json
@@ -50,8 +50,9 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Facts) -> None:
-    """Refuse a folder whose result was made with other settings. ``held`` is the record of this finished or
-    begun result. Raise InputError if ``first_difference`` finds a difference between ``held`` and ``facts``.
+    """Refuse a folder whose result was made with other settings. ``held`` is the record of the result in the
+    folder, which may be finished or only begun. Raise InputError if ``first_difference`` finds a difference
+    between ``held`` and ``facts``.
     """
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
@@ -68,8 +69,8 @@ def first_difference(then: Facts, now: Facts, *above: str) -> str:
     differs, return "".
 
     A setting in ``now`` differs if it is missing in ``then`` or has another value there. A setting that is
-    only in ``then`` differs if it lies more than one mapping deep in the record, for example among values
-    that were set by name. Elsewhere, for example in the mapping of the dataset, such a setting is ignored.
+    only in ``then`` differs if it lies at least two mappings deep in the record, for example among values
+    that were set by name. If it lies less deep, for example in the mapping ``dataset``, it is ignored.
 
     Args:
         then, now: the older and the requested settings.

@@ -45,7 +45,7 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
 @lru_cache(maxsize=1)
 def _installed(*path: str) -> metadata.EntryPoints:
     """Return the entry points of the plug-ins that are installed in the folders of ``path``, which is
-    ``sys.path``. To read those of all packages takes as long as a small job of a worker.
+    ``sys.path``. The result is cached, because reading it takes as long as a small job of a worker.
     """
     return metadata.entry_points(group=GROUP)
 
@@ -90,8 +90,8 @@ def _file_of(code: Callable[..., Any]) -> str:
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Take the options ``--plugin FILE`` out of a command line. Return the other words, and the list of the
-    plug-in files.
+    """Remove the options ``--plugin FILE`` from a command line. Return the remaining words and the list of
+    the plug-in files.
 
     Raises:
         InputError: the option is given without a file.

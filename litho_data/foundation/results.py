@@ -18,8 +18,8 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """Base class of immutable records, of which result files are composed. Unknown keys are errors. The keys
-    listed in ``FORMER`` occur only in older files and are ignored.
+    """Base class of immutable records. Result files consist of such records. Unknown keys are errors. The
+    keys listed in ``FORMER`` occur only in older files and are ignored.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset()

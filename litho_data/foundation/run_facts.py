@@ -1,4 +1,6 @@
-"""The facts that every result states about the run that made it: command, commit, versions, seeds, scans."""
+"""The facts about a run: command, commit, versions, seeds and scans. Every result states them for the run
+that made it.
+"""
 
 import platform
 import subprocess
@@ -93,7 +95,8 @@ def checkout_state(folder: Path) -> dict[str, Any]:
     """Return the ``commit`` of a checkout and whether it is ``dirty``, that is, whether any file of the
     packages is changed or untracked.
 
-    Both values are None if the folder is not a Git checkout, as for an installed wheel.
+    If the folder is not a Git checkout, for example because the package was installed from a wheel, both
+    values are None.
     """
     if not (folder / ".git").exists():
         return {"commit": None, "dirty": None}

@@ -1,4 +1,4 @@
-"""Access Zarr groups and arrays through typed functions that raise a clear InputError if stored bytes are
+"""Typed functions that read Zarr groups and arrays. They raise a clear InputError if stored bytes are
 damaged.
 """
 

@@ -1,5 +1,5 @@
-"""Refer to scans of a store by their ids. Such a reference is sent to other processes in place of the arrays,
-and these processes read the scans from the store.
+"""Refer to scans of a store by their ids. Only this reference, and not the arrays, is sent to other
+processes. These processes read the scans from the store.
 """
 
 from __future__ import annotations

@@ -84,11 +84,11 @@ def missing_files(path: Path) -> Iterator[str]:
 
 
 def _may_be_left_out(name: str, document: Facts) -> bool:
-    """Return whether the chunk of this array may be missing in a copy of a store that xarray made.
+    """Return whether the chunk of this array may be missing if the store is a copy made by xarray.
 
-    When xarray copies a store, it writes no groups, and no chunks that contain only fill values. An optional
-    column has such a chunk if it is empty for all scans of the copy. The column ``order`` has such a chunk if
-    the copy has a single scan, of order 0.
+    When xarray copies a store, it writes no groups, and no chunks that contain only fill values. The chunk of
+    an optional column contains only fill values if no scan of the copy has a value. The chunk of the column
+    ``order`` does so if the copy has a single scan, of order 0.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
@@ -186,8 +186,8 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copied store in which rows or columns were reordered, or rows or columns other than the last
-    ones were removed. The coordinates of the pixels show such changes.
+    """Refuse a copied store if rows or columns of pixels were reordered, or if any were removed that are not
+    at the end. The coordinates of the pixels show such changes.
 
     Positions in the store, such as the transforms of the scans, are relative to the first pixel. A copy may
     therefore leave out only the last rows and columns.
@@ -251,8 +251,8 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return the shape (ny, nx) of every scan without its padding. Raise InputError if a shape is larger than
-    that of the padded array.
+    """Return the shape (ny, nx) of every scan without its padding. Raise InputError if a shape exceeds the
+    shape of the padded array.
     """
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
@@ -290,7 +290,7 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
 
 
 def require_manifest(manifest: Facts, path: Path) -> None:
-    """Refuse a manifest if an entry is missing that other functions read.
+    """Refuse a manifest that lacks an entry which other functions read.
 
     A manifest that was not written by a build contains only the table of files. Fewer entries are then
     required.

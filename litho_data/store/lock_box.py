@@ -1,8 +1,8 @@
-"""Choose the lock box of a dataset: scans that are set aside for the final test, so they must not influence
-any choice of a model or an effect.
+"""Choose the lock box of a dataset. The lock box contains scans that are set aside for the final test. They
+must not influence any choice of a model or an effect.
 
-The scans are drawn by the hashes of their ids and prints, and not by the random generator of a library. The
-same dataset therefore always has the same lock box.
+The draw depends only on hashes of the ids and prints, and not on the random generator of a library. The same
+dataset therefore always has the same lock box.
 """
 
 import hashlib
@@ -60,8 +60,8 @@ def field_sha256(print_id: str, mask_level: Array, stated: Sequence[float | None
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str], fields: Sequence[str]) -> list[str]:
-    """Return the ids of the scans in the lock box. It contains all scans of a sixth of the printed fields,
-    and of at least one field. If possible, the fields are from different prints.
+    """Return the ids of the scans in the lock box. A sixth of the printed fields, and at least one, are
+    locked, if possible from different prints. The lock box contains all scans of these fields.
 
     If the dataset has only one or two fields, the lock box is empty.
 
@@ -89,7 +89,7 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str], fields: Sequence[str]
 
 
 def scans_by_field(ids: Sequence[str], fields: Sequence[str], seed: int) -> list[list[str]]:
-    """Return the ids of the scans of each printed field, with the fields in a random order.
+    """Return one list per printed field, with the ids of its scans. The fields are in a random order.
 
     Scans of one field share the errors of the print, so they must not be divided between training and test.
     """
@@ -118,5 +118,5 @@ def require_unique(ids: Sequence[str]) -> None:
 
 
 def ids_sha256(ids: Sequence[str]) -> str:
-    """Return the hex SHA-256 of a set of ids. The hash is that of the sorted ids, written one per line."""
+    """Return the hex SHA-256 of a set of ids. The hashed text contains the sorted ids, one per line."""
     return hashlib.sha256("\n".join(sorted(ids)).encode()).hexdigest()

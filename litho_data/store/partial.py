@@ -2,8 +2,8 @@
 
 A store is built in a folder ``.<name>.partial`` beside its path, and moved to this path when it is complete.
 The record of a scan is written after its arrays, so a scan is finished if its record exists. A resumed build
-reuses a finished scan only if the scan's files, parameters and code have not changed and its arrays still
-have the recorded hashes.
+reuses a finished scan only under two conditions: the scan's files, parameters and code have not changed, and
+its arrays still have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Piece:
 
 
 def outputs_of(record: Facts) -> list[Facts]:
-    """Return the descriptions (name, hash, shape, etc.) of all arrays that the steps in a scan's record
-    made.
+    """From the record of a scan, return the descriptions (name, hash, shape, etc.) of all arrays that its
+    steps made.
     """
     return [output for step in record["steps"] for output in step["outputs"]]
 
@@ -112,8 +112,8 @@ class PartialStore:
         return records
 
     def add(self, piece: Piece) -> None:
-        """Write one finished scan to disk, its record last. Several processes may call this at the same
-        time.
+        """Write one finished scan to disk. The record is written last. Several processes may call this at the
+        same time.
         """
         import zarr
 
@@ -128,7 +128,7 @@ class PartialStore:
             temporary.write_text(json.dumps(piece.record), encoding="utf-8")
 
     def samples(self, scan_id: str) -> dict[str, Array]:
-        """Return those arrays of one finished scan that lie on the layout grid, keyed by name."""
+        """Return the arrays of one finished scan that lie on the layout grid, keyed by name."""
         with np.load(self._pieces / f"{scan_id}.npz", allow_pickle=False) as archive:
             return dict(archive)
 

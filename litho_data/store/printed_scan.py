@@ -1,5 +1,5 @@
-"""Define PrintedScan, which contains the layout and the heights of one printed field and is used in the whole
-project. The module also computes the hash of its content.
+"""Define PrintedScan, which contains the layout and the heights of one printed field. The whole project uses
+this class. The module also computes the hash of a scan's content.
 """
 
 import math
@@ -18,8 +18,8 @@ class PrintedScan:
     """One printed field: the layout sent to the printer and the height measured on the layout's grid.
 
     Args:
-        id: name of the scan. ``print_id`` names the print, i.e. the block of fields to which this field
-            belongs, and ``order`` is the position of the field in the writing order.
+        id: name of the scan. ``print_id`` is the name of the print, i.e. of the block of fields that contains
+            this field. ``order`` is the position of the field in the writing order.
         mask_level: level of each pixel of the layout (the layout is also called mask), shape (ny, nx); uint8,
             or uint16 if there are more than 256 levels.
         height_um: measured height of each pixel in µm, shape (ny, nx), float32; NaN where not measured.
@@ -44,13 +44,13 @@ class PrintedScan:
         height_sigma_um: standard uncertainty of ``height_um`` in µm, shape (ny, nx), float32; NaN where not
             valid. It does not include the uncertainty of the scan's zero height. None means that the store
             does not contain it.
-        groups: parts of the scan's id, such as the number of the field. The named groups of the id pattern in
-            the dataset card capture them. The group ``print`` is left out.
+        groups: parts of the scan's id, such as the number of the field, keyed by name. They are the named
+            groups of the id pattern in the dataset card, except the group ``print``.
         instrument: name of the instrument, if the card's table gives it. ``seen_by`` is the kind of
             instrument, which determines what the heights mean (see ``Instrument``).
         surround: what lies around the printed field. ``substrate`` means bare substrate, which the layout
             shows as a rim of level 0. ``continues`` means more of the same print. The layout does not show
-            this part of the print, so the outermost pixels are not valid. The default is ``unknown``.
+            this surrounding print, so the outermost pixels are not valid. The default is ``unknown``.
     """
 
     id: str

@@ -138,8 +138,8 @@ class Store:
         """Match one id with the id pattern of the card, and return the values of the pattern's named groups.
         The group ``print`` is left out.
 
-        If the pattern contains repetitions, the result is empty, because matching such a pattern may never
-        finish, and the store may come from anywhere.
+        If the pattern contains repetitions, the result is empty. Matching such a pattern may never finish,
+        and a store of unknown origin may contain it on purpose.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -197,7 +197,7 @@ class Store:
     @cached_property
     def locked_ids(self) -> list[str]:
         """Return the ids of the scans in the lock box, which are set aside for the final test. The lock box
-        consists of all scans of a sixth of the printed fields; it is always the same for the same dataset.
+        consists of all scans of a sixth of the printed fields. For the same dataset, it is always the same.
         """
         fields = [
             field_sha256(
@@ -269,14 +269,14 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Return the hash of the dataset, which does not depend on how the arrays are divided into chunks. It
-        is computed once.
+        """Return the hash of the dataset. The hash does not depend on how the arrays are divided into chunks,
+        and is computed only once.
         """
         return self.computed_sha256()
 
     @property
     def dataset_id(self) -> DatasetId:
-        """Return the name and the hash of the dataset, which are recorded in results made from it."""
+        """Return the name and the hash of the dataset. Results that are made from the dataset record both."""
         return DatasetId(name=self.name, sha256=self.sha256)
 
     def computed_sha256(self) -> str:

@@ -1,5 +1,5 @@
-"""Define which arrays (listed in ``variables.toml``) and columns a dataset store has, and how the hash of a
-dataset is computed.
+"""Define the arrays and columns of a dataset store, and the hash of a dataset. The file ``variables.toml``
+lists the arrays.
 """
 
 from collections.abc import Sequence
@@ -65,7 +65,7 @@ scans, the uncertainty of the heights, and arrays of single scans.
 """
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layout grid, including the uncertainty of the heights."""
-# Maps each array whose elements have different units to a text that states these units. The hash of such an
+# For each array whose elements have different units, a text that states these units. The hash of such an
 # array uses the unit 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}

@@ -36,8 +36,8 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Write the group ``scans/<id>``. It contains those arrays of a scan that lie on the scan's own pixel
-    grid, and is also an OME-Zarr image.
+    """Write the group ``scans/<id>``. It contains the arrays of a scan that lie on the scan's own pixel grid.
+    The group is also an OME-Zarr image.
 
     Args:
         root: the open root group of the store.
@@ -127,7 +127,7 @@ def write_table(
 ) -> None:
     """Write a table as a group of one-dimensional arrays over ``dim``; all strings are encoded in UTF-8.
 
-    Only one array per type of column is created, in memory. Each column is written to the array of its type,
+    For each type of column, one array is created in memory. Each column is written to the array of its type,
     and the files of this array are then copied to the store. To create one array per column would take three
     times as long.
     """
@@ -170,7 +170,8 @@ def _column(group: zarr.Group, name: str, size: int, dim: str, dtype: Any, **mor
 
 
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
-    """Create an array, compressed by Zstandard after a byte shuffle, with a checksum that reveals damage.
+    """Create an array. Its bytes are shuffled and then compressed by Zstandard, and a checksum reveals
+    damage.
 
     Chunks that contain only fill values are written too. By default, zarr writes no file for such a chunk.
     The chunk could then not be distinguished from a lost one.
