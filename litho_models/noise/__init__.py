@@ -1,5 +1,5 @@
-"""Estimate the noise of prints, and test whether stated uncertainties are calibrated. The noise is the part
-of the error that no model can predict.
+"""Estimate the noise of prints, which is the part of the error that no model can predict. Also test whether
+stated uncertainties are calibrated.
 """
 
 from litho_models.noise.analyse import analyse_noise, analyse_noise_of_files

@@ -35,18 +35,18 @@ def analyse_noise(
     """Analyse the noise of the prints in a store. Write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. The analysis also uses its scans of bare substrates, flat prints and steps, and
-            all scans that state a dose.
+        store: dataset store. The analysis also uses the reference scans in it (bare substrates, flat prints
+            and steps), and all scans with a stated dose.
         out: result folder.
         residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
-            With residuals, the analysis also contains the spread σ(x) of the residual at each pixel, and a
-            test of whether this spread is calibrated. If every scan is predicted by a model that was not
-            trained on it (as in a benchmark), two upper limits of the noise are added (see ``NoiseBudget``).
+            With residuals, the analysis also contains the spread σ(x) of the residual at each pixel x, and a
+            test of its calibration. If every scan is predicted by a model that was not trained on this scan
+            (as in a benchmark), two upper limits of the noise are added (see ``NoiseBudget``).
         model: name of a model in the benchmark; by default the best model.
         seed: seed of the random choice of pixels.
 
     Raises:
-        InputError: the store or the residuals cannot be read, or do not belong together.
+        InputError: the store or the residuals cannot be read, or the residuals belong to another dataset.
     """
     if model is not None and residuals is None:
         raise InputError(

@@ -25,11 +25,12 @@ _FEWEST_PIXELS = 1000
 
 
 class FlatLevel(Record):
-    """The size of the residual at those pixels of one level at which the layout is flat: its rms
-    (``sigma_nm``) and its mean absolute value (``mae_nm``).
+    """The rms (``sigma_nm``) and the mean absolute value (``mae_nm``) of the residual at pixels of one level
+    in areas where the layout is flat.
 
-    Before that, the terms of the policy ``full+rows`` are removed from each scan. They include line offsets.
-    ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm``, from resampling prints.
+    The residual is computed after the terms of the policy ``full+rows``, which include line offsets, are
+    removed from each scan. ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm``, from resampling
+    prints.
     """
 
     level: int
@@ -44,9 +45,9 @@ class NoiseBudget(Record, extra="ignore"):
     """Two estimates of an upper limit of the noise of prints.
 
     ``floor`` is computed from pixels with similar surroundings (see ``floor_of_residuals``). ``flat_levels``
-    is computed from the pixels at which the slope of the layout is at most ``flat_slope``, the lower quartile
-    of the slope. ``flat_texture`` is the texture of the residual at these pixels. For the texture, only the
-    terms of the policy ``full`` are removed, so it still contains line offsets.
+    is computed from the pixels at which the slope of the layout is at most ``flat_slope``, which is the lower
+    quartile of this slope. ``flat_texture`` is the texture of the residual at these pixels. For the texture,
+    only the terms of the policy ``full`` are removed, so it still contains line offsets.
     """
 
     model: str

@@ -73,9 +73,9 @@ class Calibration(Record, extra="ignore"):
         levels: nominal coverages of the intervals. For a calibrated spread, ``coverage`` equals ``levels``.
         nll, crps_nm, coverage, ence, ause: means over scans of the fields of ``ScanCalibration`` with the
             same names.
-        pit: histogram of the probability integral transform. The transform of a pixel is the probability,
-            under the stated distribution, of a residual below the observed residual. The 20 bins add up to
-            one. If the stated distribution is right, the histogram is flat.
+        pit: histogram of the probability integral transform. For each pixel, the transform is the stated
+            probability that a residual is below the observed residual. The 20 bins add up to one. If the
+            stated distribution is right, the histogram is flat.
     """
 
     name: str
@@ -91,8 +91,8 @@ class Calibration(Record, extra="ignore"):
 
 
 class SigmaBin(Record, extra="ignore"):
-    """The results for the pixels at which one covariate lies in one range: the measured and the predicted
-    spread of the residual, and the coverage of the stated intervals.
+    """The results for the pixels at which a covariate lies in a given range. They are the measured and the
+    predicted spread of the residual, and the coverage of the stated intervals.
 
     The coverage is stated for the 68 % and the 95 % interval. Each coverage has a 95 % confidence interval
     from resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.
@@ -114,11 +114,11 @@ class SigmaBin(Record, extra="ignore"):
 
 class SpreadAnalysis(Record, extra="ignore"):
     """The spread σ(x) of the residuals of one model, and its calibration. ``bins`` is computed on scans that
-    were not used to fit the spread. ``variance`` is a model of the spread that is fitted to all scans.
+    were not used to fit the spread. ``variance`` is the model of the spread after a fit to all scans.
 
-    ``nuisance`` names the terms that were removed from the residuals. Each fit of the spread is tested on
-    data that were left out of this fit. ``left_out`` says whether these are all scans of one print
-    (``prints``) or a group of scans (``scans``).
+    ``nuisance`` names the terms that were removed from the residuals. For each test, the spread is fitted
+    anew without the data on which it is tested. ``left_out`` says whether these data are all scans of one
+    print (``prints``) or a group of scans (``scans``).
     """
 
     model: str
@@ -272,8 +272,8 @@ def _bins(
 
 
 def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[str, float, float, Array]]:
-    """Yield each group of pixels as a tuple: the name of the covariate, the lowest and highest value of the
-    covariate in the group, and a mask of its pixels.
+    """Yield each group of pixels as a tuple. It contains the name of the covariate, the lowest and highest
+    value of this covariate in the group, and a mask of the group's pixels.
     """
     level = pool.of([scan.mask_level for scan in pool.scans])
     yield "all", 0, 0, np.ones(level.size, bool)

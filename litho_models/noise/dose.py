@@ -2,8 +2,8 @@
 the roughness and the number of steps that were lost. Then recommend a dose.
 
 The paper searches for a laser power in this way (appendix "Mask and optical elements fabrication"). The
-evaluation uses all scans that state a dose. Suitable layouts are step ladders, and any other layouts in which
-areas of one level are wider than the blur of the printer.
+evaluation uses all scans that state a dose. A layout is suitable if areas of one level are wider than the
+blur of the printer, as in a step ladder.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ from litho_models.scoring.like_layouts import blurred_layout_um
 # Pixels closer than this to a change of level are not used. The distance is about four standard deviations of
 # the optical spot, or two standard deviations of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
-# A step counts as lost if its height, divided by the number of levels that it spans, is less than this
-# fraction of the median of this ratio over all steps at the same dose.
+# For each step, the height is divided by the number of levels that the step spans. The step counts as lost if
+# the ratio is less than this fraction of the median ratio of all steps at the same dose.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
@@ -50,13 +50,13 @@ class DoseRow(Record, extra="ignore"):
             straight-line fit.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation of the height within areas of one level.
-        lost_low: number of lost steps in an unbroken sequence that starts at the lowest level. Steps are lost
-            there because under-exposed resist does not remain. A step counts as lost if its height, divided
-            by the number of levels that it spans, is less than half the median of this ratio over all steps
-            at this dose. The median is taken at the same dose, so that shrinkage does not count as wrong
-            exposure.
-        lost_high: number of lost steps in an unbroken sequence that ends at the highest level. Steps are lost
-            there because over-exposed resist cannot react any further.
+        lost_low: number of successive lost steps from the lowest level upwards. Steps are lost there because
+            under-exposed resist does not remain. For each step, the height is divided by the number of levels
+            that the step spans. The step counts as lost if this ratio is less than half the median ratio of
+            all steps at the same dose. If all steps shrink by the same factor, the median shrinks too, so
+            shrinkage does not count as wrong exposure.
+        lost_high: number of successive lost steps from the highest level downwards. Steps are lost there
+            because over-exposed resist cannot react any further.
         worst_readability: smallest ratio of the height of a step to the standard deviation σ of single pixels
             on its two levels. If this ratio is at least 3.92, single pixels of the two levels can be told
             apart.
@@ -85,8 +85,8 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Evaluate every dose that a scan states. Return the dose matrix, and notes that say which doses are not
-    evaluated, and why. If too few doses can be evaluated, None is returned instead of the matrix.
+    """Evaluate every stated dose. Return the dose matrix, or None if too few doses can be evaluated. Also
+    return notes that say which doses are not evaluated, and why.
 
     A dose is evaluated only if three levels have areas that are wide enough to measure. A matrix needs at
     least two such doses. Among the doses at which the fewest steps are lost, the dose with a ``height_gain``
@@ -158,9 +158,9 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], list[LevelHeight]]:
     """Return the scans that are used, and the mean and standard deviation of the height of each level. Only
-    pixels far from every change of level count. The datum, the tilt and the effect of the surrounding layout
-    are first removed from each scan. If no chain of shared levels links a scan to the other scans, it is not
-    used, because its datum is unknown.
+    pixels that are far from every change of level are used. The datum, the tilt and the effect of the
+    surrounding layout are first removed from each scan. A scan is used only if shared levels link it to the
+    scan with the most levels, directly or through other scans. Otherwise, its datum is unknown.
     """
     found = [_level_parts(scan) for scan in scans]
     linked = _linked_levels(found)
@@ -181,8 +181,8 @@ def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], lis
 
 
 def _level_parts(scan: PrintedScan) -> dict[int, Array]:
-    """For each level, return the heights, nm, of those pixels that are far from every change of level. The
-    tilt and the effect of the surrounding layout are removed, but not the datum.
+    """For each level, return the heights, nm, of its pixels that are far from every change of level. The tilt
+    and the effect of the surrounding layout are removed. The datum is not removed.
     """
     inside = _plateaus(scan)
     if not inside.any():
@@ -191,9 +191,9 @@ def _level_parts(scan: PrintedScan) -> dict[int, Array]:
     y, x = np.nonzero(inside)
     present = np.unique(level)
     dummies = (level[:, None] == present[None, :]).astype(np.float64)
-    # The fit has one height per level, one tilt, and an effect of the surroundings. Height differences within
-    # areas of one level distinguish the tilt and the effect of the surroundings from the heights of the
-    # levels.
+    # The fit has one height per level, one tilt, and an effect of the surroundings. The tilt and the
+    # surroundings also change the height within areas of one level, so the fit can separate them from the
+    # heights of the levels.
     slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
     others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
     height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
@@ -255,8 +255,8 @@ def _run_length(flags: Array) -> int:
 
 
 def _pooled_sd(parts: Sequence[Array]) -> float:
-    """Return the pooled standard deviation of values around the mean of their part. Return 0 if no part has
-    two values.
+    """Return the pooled standard deviation of the values in ``parts`` around the mean of each part. Return 0
+    if no part has two values.
     """
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Draw the height map of each reference scan, with its mean subtracted. All maps except those of steps
+    """Draw the height map of each reference scan, minus its mean. The maps of substrates and flat prints
     share one colour scale.
     """
     figure = new_figure(3.1 * len(references) + 0.6, 3.2)
@@ -72,8 +72,8 @@ def dose(found: DoseMatrix) -> Figure:
 
 
 def spread(found: SpreadAnalysis) -> Figure:
-    """Draw the rms of the residual in ranges of each covariate: the measured values as points and the
-    predicted values as a line.
+    """Draw the rms of the residual in ranges of each covariate. Points show the measured rms, and a line
+    shows the predicted rms.
     """
     names = list(dict.fromkeys(row.covariate for row in found.bins if row.covariate != "all"))
     figure = new_figure(2.8 * len(names), 2.9)

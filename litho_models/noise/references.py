@@ -43,8 +43,8 @@ class Reference:
 
 
 class ReferencePrints(Record):
-    """The results from the reference scans: the roughness of each substrate and flat print, the roughness
-    that the print alone adds, and the evaluation of steps.
+    """The results from the reference scans. They are the roughness of each substrate and flat print, the
+    roughness that printing adds to the substrate, and the evaluation of steps.
 
     ``textures`` contains the textures of those substrates and flat prints whose scans have square pixels,
     after a quadratic background is removed.
@@ -170,8 +170,8 @@ def _sigma_interval(squares_nm2: np.ndarray, prints: Sequence[tuple[str, str]]) 
     """Return the 95 % confidence interval of the root of the mean of ``squares_nm2``, which has one value per
     pair of prints.
 
-    Pairs that share a print are not independent. Therefore the N prints are resampled. Each print is
-    represented by its jackknife pseudo-value, which is N times the mean over all pairs minus N - 1 times the
+    Pairs that share a print are not independent, so the N prints are resampled instead of the pairs. Each
+    print is represented by its jackknife pseudo-value: N times the mean over all pairs, minus N - 1 times the
     mean over the pairs without this print. If all pairs of the N prints are compared and the noise is white,
     the pseudo-value equals the variance of the noise of this print.
     """
@@ -186,8 +186,8 @@ def _sigma_interval(squares_nm2: np.ndarray, prints: Sequence[tuple[str, str]]) 
 
 
 def _different_fields(first: PrintedScan, second: PrintedScan) -> bool:
-    """Return True if two scans are known to show different printed fields: fields of two prints, or fields of
-    one print for which different positions are stated.
+    """Return True if two scans are known to show different printed fields. This is so if the fields belong to
+    two prints, or if different positions in one print are stated for them.
     """
     places = [(scan.field_x_um, scan.field_y_um) for scan in (first, second)]
     stated = all(None not in place for place in places)

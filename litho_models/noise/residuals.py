@@ -26,12 +26,12 @@ from litho_models.scoring.statistics import Interval, pixel_interval
 
 
 class Residuals(NamedTuple):
-    """The residuals of a model on each scan. A residual is the measured minus the predicted height.
+    """The residuals of a model on each scan. A residual is the measured height minus the predicted height.
 
     Attributes:
         maps_um: height maps that the model predicts, µm, one of shape (ny, nx) for each scan.
-        residuals_nm: residuals of each scan, nm, after the terms of ``protocol`` are removed, with shape (ny,
-            nx). The residuals are NaN at pixels that are not scored.
+        residuals_nm: residuals of each scan, nm, after the terms of ``protocol`` are removed, one map of
+            shape (ny, nx) for each scan. The maps are NaN at pixels that are not scored.
         held_out: True if every scan is predicted by a model that was not trained on it.
     """
 
@@ -45,7 +45,7 @@ class Residuals(NamedTuple):
 
 class Pool(NamedTuple):
     """Some pixels of several scans, treated as one list of n pixels. ``used`` contains one mask of shape (ny,
-    nx) for each scan, which is True at these pixels.
+    nx) for each scan. The mask is True at the pixels in the list.
     """
 
     scans: Sequence[PrintedScan]
@@ -67,7 +67,7 @@ class Pool(NamedTuple):
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
     """Return the residuals (measured minus predicted height) of each scan, after the per-scan terms are
-    removed. The terms that are removed from a pixel were fitted to other pixels.
+    removed. The terms are fitted to pixels other than those from which they are removed.
 
     The scored pixels, the policy and the background are the same as in the benchmark or, for a frozen model,
     as in ``evaluate``. The mean absolute value of the residuals is therefore the error that the benchmark or

@@ -1,5 +1,5 @@
-"""Score a stated spread of residuals. Some scores are computed in closed form for a Gaussian or Student's t
-distribution; two others (ENCE and AUSE) do not assume any distribution.
+"""Compute scores that state how good a predicted spread of residuals is. Two scores (ENCE and AUSE) do not
+assume any distribution. The others have closed forms for a Gaussian and for Student's t distribution.
 
 The continuous ranked probability score (CRPS) of a Gaussian is equation 21 of Gneiting and Raftery 2007,
 doi:10.1198/016214506000001437, with the opposite sign.
@@ -32,8 +32,9 @@ class Tails:
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
     def weight(self, z2: Array) -> Array | float:
-        """Return the weight of a squared residual in a fit: −2 times the derivative of the log density with
-        respect to z², where z is the residual divided by its scale. For a Gaussian, the weight is 1.
+        """Let z be a residual divided by its scale, and ``z2`` its square. Return the weight of this residual
+        in a fit, which is −2 times the derivative of the log density with respect to z². For a Gaussian, the
+        weight is 1.
         """
         return 1.0 if np.isinf(self.freedom) else (self.freedom + 1) / (self.freedom + z2)
 
@@ -57,14 +58,14 @@ class Tails:
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Return half the width of the central interval in which a residual lies with the probability
-        ``level``. The width is stated in units of the scale of the distribution.
+        """Return half the width, in units of the scale of the distribution, of the central interval in which
+        a residual lies with the probability ``level``.
         """
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
         """Return, for each pixel, whether its residual lies within the central interval for the probability
-        ``level``. For a calibrated spread, the share of pixels for which this is true equals ``level``.
+        ``level``. If the spread is calibrated, this is true for the share ``level`` of the pixels.
         """
         return np.abs(residual) <= self.half_width(level) * scale
 
@@ -106,8 +107,8 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
 
 
 def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
-    """Divide values into bins with equal numbers of values. Return the limits of the bins, and for each value
-    the number of its bin. If values repeat, there may be fewer than ``bins`` bins.
+    """Divide values into bins with equal numbers of values. Return the limits of the bins, and the bin number
+    of each value. If values repeat, there may be fewer than ``bins`` bins.
     """
     limits = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
     return limits, np.searchsorted(limits[1:-1], values, side="right")

@@ -77,8 +77,8 @@ def step_print(
         scan_id: name of the scan in the result.
         height_um: measured height, µm, with shape (ny, nx); NaN where it was not measured.
         pitch_um: pixel pitch along y and x, µm.
-        level_height_um: nominal height of a step, µm. An edge counts only if the heights on its two sides
-            differ by at least about half of this.
+        level_height_um: nominal height of a step, µm. An edge is found only if the heights on its two sides
+            differ by at least about half this step.
 
     Raises:
         InputError: no step was found.
@@ -124,8 +124,9 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
 
     A piecewise-constant function is fitted to the profile of the staircase. At each position along the axis,
     the profile is the median of the heights along the line parallel to the edges. The fit minimises the
-    squared error plus a price for each edge. The price equals the amount by which a single edge reduces the
-    squared error if its two treads have the smallest width and their heights differ by half a level.
+    squared error plus a price for each edge. To set the price, consider two treads of the smallest width
+    whose heights differ by half a level. The price is the amount by which an edge between them reduces the
+    squared error.
 
     A tilt along the axis would add edges, so the tilt is removed first. Columns or rows without a measured
     pixel are skipped.
@@ -183,10 +184,10 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float:
-    """Return the median slope of a profile between its edges, in µm per unit of ``position``. Edges that were
-    found only because the profile is tilted do no harm: between them, the profile still has the slope of the
-    tilt. Only the middle of each piece is used, because the blurred edges may reach far into a narrow tread.
-    The result is 0 for a profile of fewer than two pixels.
+    """Return the median slope of a profile between its edges, in µm per unit of ``position``. Some edges may
+    have been found only because the profile is tilted. They do no harm, because between them the profile
+    still has the slope of the tilt. Only the middle of each piece is used, because the blurred edges may
+    reach far into a narrow tread. The result is 0 for a profile of fewer than two pixels.
     """
     if len(profile) < 2:
         return 0.0
@@ -199,8 +200,8 @@ def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Return the range of columns of each tread. On both sides, ``guard_px`` columns are left out, but at
-    most a third of the tread.
+    """Return the range of columns of each tread, without ``guard_px`` columns at either end. In a narrow
+    tread, only a third of its columns is left out at either end.
     """
     ends = pairwise([0, *edges_px, shape[1]])
     insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]

@@ -100,8 +100,8 @@ def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> Print
 
     Args:
         flat: roughness of the flat print.
-        substrates: roughness of one or more substrates, after the same kind of background was removed as from
-            the flat print.
+        substrates: roughness of one or more substrates, from which the same kind of background was removed as
+            from the flat print.
     """
     square = flat.sigma_nm**2 - np.mean([one.sigma_nm**2 for one in substrates])
     if square <= 0:

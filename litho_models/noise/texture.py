@@ -1,5 +1,5 @@
-"""Describe the texture of flat surfaces: whether it consists of lines, in which direction the lines run, and
-with which period they repeat.
+"""Describe the texture of flat surfaces. The description states whether the texture consists of lines, in
+which direction the lines run, and with which period they repeat.
 
 The paper says that the roughness of its flat print is line-shaped and not periodic (arXiv:2309.17343).
 """
@@ -22,8 +22,8 @@ class Period(Record, extra="ignore"):
     Args:
         period_um: distance at which the lines repeat, µm.
         share: fraction of the sum of squares of the line means that is due to this period.
-        p: p value of the peak, i.e. the probability that random line means with a smooth spectrum have a peak
-            at least this significant at some frequency.
+        p: p value of the peak. It is the probability that random line means with a smooth spectrum have a
+            peak that is at least as significant, at any frequency.
         amplitude_nm: amplitude of the oscillation with this period, as root mean square over the surfaces.
         coherence: 1 if the lines have the same phase on all surfaces. The phase is counted from the first
             pixel of each array.
@@ -57,7 +57,8 @@ class Texture(Record):
 
     Args:
         angle_deg: direction of the lines in degrees; 0 is along x, and positive angles turn from x to y.
-        strength: directional strength; 0 if all directions are alike, 1 if all lines have one direction.
+        strength: how strongly one direction prevails; 0 if all directions are alike, 1 if all lines have one
+            direction.
         isotropic_p: p value of the direction, i.e. the probability that an isotropic surface has at least
             this ``strength``.
         lines: results for the lines along x, then for the lines along y.

@@ -50,7 +50,7 @@ class VarianceModel(Record):
 
     The covariates are:
 
-    - the level, scaled to 0 ... 1, with a dependence that is linear between knots;
+    - piecewise linear functions of the level, which is scaled to 0 ... 1;
     - the slope of the blurred layout (height over length), and its square;
     - the distance to the nearest change of level, limited to 2 µm and divided by this limit;
     - the second and the fourth power of r, the distance from the centre of the field divided by half the
@@ -84,7 +84,7 @@ def place_maps(scan: PrintedScan) -> dict[str, Array]:
 
 def covariates_of(places: dict[str, Array]) -> Array:
     """Return the covariates φ of each pixel, with shape (..., covariates). ``places`` is the result of
-    ``place_maps``, or a dict of the same form that contains only the values at some pixels.
+    ``place_maps``, or a dict with the same keys and the values at some of the pixels.
     """
     level, slope, edge, radius2 = (places[name] for name in PLACES)
     between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]

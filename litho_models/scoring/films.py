@@ -23,7 +23,8 @@ FILMS_TEXT = (
 
 class FilmErrors(NamedTuple):
     """The errors of a predicted film. ``area_error_percent`` is the absolute error of the predicted area, in
-    percent of the measured area, or None if the measured area is zero. The other fields count features.
+    percent of the measured area. It is None if the measured area is zero. The other fields are numbers of
+    features.
     """
 
     area_error_percent: float | None
@@ -66,8 +67,8 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """Find the connected parts of two masks, and use those with at least four pixels. For each part of one
-    mask, count the parts of the other mask that it overlaps. Return the counts for the parts of the first
+    """Find the connected parts of two masks. Parts of fewer than four pixels are ignored. For each part of
+    one mask, count the parts of the other mask that it overlaps. Return the counts for the parts of the first
     mask, and the counts for the parts of the second mask.
     """
     from scipy.ndimage import label

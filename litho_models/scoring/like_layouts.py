@@ -1,10 +1,10 @@
 """Separate noise from errors of a model by comparing residuals at pixels whose surroundings in the layout are
 similar (gamma test).
 
-What residuals in similar surroundings have in common is an error of the model, because another model could
-predict it from the layout. The differences between such residuals are noise (Stefánsson, Končar and Jones
-1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of other scans. The datum, the gain and the
-bow of a single scan therefore count as noise.
+In similar surroundings, the part that all residuals have in common is an error of the model, because another
+model could predict it from the layout. The differences between these residuals are noise (Stefánsson, Končar
+and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of other scans. The datum, the
+gain and the bow of a single scan therefore count as noise.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
 
 class LikePixels(NamedTuple):
-    """A random sample of n pixels and, for each of them, the m most similar pixels (partners), each from
-    another scan. m is at most ``PARTNERS``.
+    """A random sample of n pixels. For each of them, the sample also lists its partners, which are the m most
+    similar pixels, each from another scan. m is at most ``PARTNERS``.
 
     Attributes:
         owner: number of the scan that contains the pixel; shape (n,).
@@ -42,12 +42,12 @@ class LikePixels(NamedTuple):
         """Return, for each pixel of the sample, an estimate of the noise variance, and the squared residual.
         Both arrays have shape (n,).
 
-        Let r₀ be the residual of a pixel, and r₁ ... r_m the residuals of its partners. Each of them is the
-        sum of its own noise and a misfit, which is the same for all of them because their surroundings are
-        similar. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k therefore estimates the variance of the noise
-        in r₀, however large the noise of the partners is. Half the squared difference of two residuals would
-        be a simpler estimate, but too small for pixels with rare surroundings, because such pixels are
-        rougher than their partners.
+        Let r₀ be the residual of a pixel, and r₁ ... r_m the residuals of its partners. Each residual is the
+        sum of its own noise and a misfit. The misfit is the same for all these residuals, because the
+        surroundings are similar. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k therefore estimates the
+        variance of the noise in r₀, however large the noise of the partners is. A simpler estimate would be
+        half the squared difference of two residuals. It would be too small for pixels with rare surroundings,
+        because such pixels are rougher than their partners.
 
         Args:
             residuals: one residual map per scan, of shape (ny, nx). Both results have the squared unit of
@@ -69,8 +69,8 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
     compared, because the dose changes the height even if the layouts are equal.
 
     Args:
-        scans: scans to compare. The result is None if no dose is common to at least three scans, or if the
-            layouts are flat.
+        scans: scans to compare. If no dose is common to at least three scans, or if the layouts are flat, the
+            result is None.
         scored: for each scan, a mask of shape (ny, nx) that is True at the pixels that may be drawn.
         seed: determines which pixels are drawn.
     """

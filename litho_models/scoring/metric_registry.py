@@ -80,7 +80,8 @@ _MEASUREMENTS = [
 def register_metric(
     name: str, unit: str, function: MetricFunction, explanation: str, *, over_scans: Summary = "mean"
 ) -> Metric:
-    """Register a metric. Until the Python process ends, every evaluation and every benchmark computes it.
+    """Register a metric. From then on, every evaluation and every benchmark in this Python process computes
+    it.
 
     ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan`` and two maps in µm, of shape
     (ny, nx). The first map is the predicted height. The second map is the measured minus the predicted
@@ -99,8 +100,8 @@ def register_metric(
         unit: unit of the metric, which must also be a Python identifier; ``1`` for a metric without a unit.
         function: function that computes the metric of one scan, as described above.
         explanation: sentence that explains the metric in the report.
-        over_scans: ``mean`` or ``sum``. The metric of a model is this mean or this sum of the values of
-            single scans. Values that are None are left out.
+        over_scans: ``mean`` or ``sum``. The metric of a model is the mean or the sum of the values of all
+            scans. Scans with the value None are left out.
 
     Raises:
         InputError: the name or the unit is not an identifier, the name is already taken, or ``over_scans`` is
@@ -154,8 +155,8 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
 
 
 def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
-    """Combine the metrics of scans into the metrics of a model. Each metric is the mean or the sum of its
-    values over those scans for which it is known. Return them as the fields of ``MetricValues``.
+    """Combine the metrics of scans into the metrics of a model. Each metric is the mean or the sum over the
+    scans for which it is known. Return them as the fields of ``MetricValues``.
     """
     values = {}
     for metric in registered_metrics():

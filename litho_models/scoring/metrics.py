@@ -34,13 +34,13 @@ class PrintGain(NamedTuple):
 def print_gain(
     height_um: Array, prediction_um: Array, used: Array, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
-    """Fit the measured height of a scan by a straight line in the predicted height, by least squares over the
-    selected pixels.
+    """Fit the measured height of a scan by a linear function of the predicted height. The fit uses least
+    squares over the selected pixels.
 
     Residuals of neighbouring pixels are correlated, so the standard error is computed from blocks of pixels
-    (Liang and Zeger 1986). In each block, the products of residual and regressor (predicted height) are
-    summed. The sums of different blocks are assumed to be statistically independent. This holds if the blocks
-    are wide compared with the correlation length, which is 7 px on the measured prints.
+    (Liang and Zeger 1986). In each block, the products of residual and predicted height (the regressor) are
+    summed. These sums are assumed to be independent from block to block. This holds if the blocks are wide
+    compared with the correlation length, which is 7 px on the measured prints.
 
     Args:
         height_um, prediction_um: measured and predicted height, µm, of shape (ny, nx).
@@ -99,8 +99,8 @@ def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtoco
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Return the datum-free error of a model, nm, averaged over scans. The policy is ``offset``: an offset is
-    fitted to each scan. ``heights_um`` contains the predicted height of each scan, µm, of shape (ny, nx).
+    """Return the datum-free error of a model, nm, averaged over scans. An offset is fitted to each scan
+    (policy ``offset``). ``heights_um`` contains the predicted height of each scan, µm, of shape (ny, nx).
     """
     protocol = NuisanceProtocol()
     residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))

@@ -1,5 +1,5 @@
-"""Estimate the noise floor of a dataset, which is the smallest error that any model can have. It is estimated
-for each policy, that is, for each set of per-scan terms that may be fitted.
+"""Estimate the noise floor of a dataset, which is the smallest error that any model can have. There is one
+floor for each policy, i.e. for each set of per-scan terms that may be fitted.
 
 If there are flat or repeated prints, the floor is measured on them. Otherwise it is estimated from the
 residuals of a model on held-out scans, by comparing pixels with similar surroundings (``like_layouts``).
@@ -46,8 +46,8 @@ class NoiseFloor(Record):
 
     ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error for the
     policy ``offset``, i.e. after an offset is fitted to each scan. ``by_policy`` contains the floors for each
-    policy. This list is empty in older result files, and if only the floor for the policy ``offset`` is
-    known. The kinds ``lower-bound`` and ``literature`` occur only in older files.
+    policy. It is empty if only the floor for the policy ``offset`` is known, and in older result files. The
+    kinds ``lower-bound`` and ``literature`` occur only in older files.
     """
 
     mae_nm: float | None
@@ -91,8 +91,8 @@ def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
 
     Args:
         dataset_name: name of the dataset for which errors are reported.
-        analysis: path of a ``noise.json`` or of its folder. The analysis must be about this dataset, or about
-            scans that belong to no dataset.
+        analysis: path of a ``noise.json`` or of its folder. The analysis must have been made from this
+            dataset, or from files of single scans.
 
     Raises:
         InputError: there is no noise analysis at this path, or it belongs to another dataset.
@@ -152,12 +152,12 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """Estimate an upper limit of the noise floor from the residuals of a model on held-out scans.
 
-    ``LikePixels`` estimates the noise from differences between pixels with similar surroundings. From a
-    random sample of pixels, it gives the fraction of the squared error that is noise. The floor is the error
-    over all scored pixels times the square root of this fraction. For the mean absolute error, this assumes
-    that noise and residual have the same ratio of mean absolute value to standard deviation. The assumption
-    is true if nearly all of the residual is noise, whatever the distribution of the noise. An unfavourable
-    case is Gaussian noise with a misfit that has a Laplace distribution, or the reverse. If half of the
+    ``LikePixels`` estimates the noise from differences between pixels with similar surroundings. It yields
+    the fraction of the squared error that is noise, in a random sample of pixels. The floor is the error over
+    all scored pixels times the square root of this fraction. For the mean absolute error, this assumes that
+    noise and residual have the same ratio of mean absolute value to standard deviation. The assumption is
+    true if nearly all of the residual is noise, whatever the distribution of the noise. In an unfavourable
+    case, the noise is Gaussian and the misfit has a Laplace distribution, or the reverse. If half of the
     squared error came from such a misfit, the floor would be wrong by up to 6 %.
 
     Args:

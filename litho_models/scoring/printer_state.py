@@ -1,5 +1,5 @@
-"""Describe the state of the printer by values from single scans: the gain of the heights, the error of the
-model, and the kind of layout.
+"""Describe the state of the printer by values from single scans. For each scan, they are the gain of the
+heights, the error of the model, and numbers that describe the layout.
 """
 
 from collections.abc import Sequence

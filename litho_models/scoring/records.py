@@ -26,8 +26,8 @@ LEADING["sem"] = "edge_mean_nm"
 
 
 class Prediction(NamedTuple):
-    """What a model predicts for a scan: the height of the print and, if known, the height that the microscope
-    adds to it (``background_um``). Both are maps in µm, of shape (ny, nx).
+    """The prediction of a model for a scan. It contains the height of the print and, if known, the height
+    that the microscope adds to it (``background_um``). Both are maps in µm, of shape (ny, nx).
     """
 
     height_um: Array
@@ -120,11 +120,11 @@ class ModelScores(MetricValues, extra="ignore"):
     """All scores of one model. Errors are means over scans, counts are sums over scans, and confidence
     intervals come from resampling scans.
 
-    ``by_policy`` and ``without_background`` contain the mean absolute error for each policy: with the
-    background of the protocol, and without it. ``without_background`` is empty if the protocol has no
-    background. If the background is smooth (``training``), ``without_background`` lists only policies without
-    tilt and bow, because these terms would absorb the background. ``phase_rms_waves`` is the RMS phase error,
-    in waves, of light that passes through the print.
+    ``by_policy`` contains the mean absolute error for each policy, with the background of the protocol.
+    ``without_background`` contains the same errors without this background. ``without_background`` is empty
+    if the protocol has no background. If the background is smooth (``training``), ``without_background``
+    lists only policies without tilt and bow, because these terms would absorb the background.
+    ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes through the print.
     """
 
     model: str
@@ -148,7 +148,7 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_nm(self) -> float:
-        """Return the leading error, by which models are ranked, nm. For films it is the mean shift of the
+        """Return the leading error in nm, by which models are ranked. For films, it is the mean shift of the
         edges. For other scans it is the datum-free error of the height.
         """
         return float(getattr(self, LEADING[self.seen_by]))

@@ -69,8 +69,9 @@ def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -
     """Compare the measured edges of a scan with the predicted edges. The measured map without the per-scan
     terms is the prediction plus the residual.
 
-    For films, ``mean_nm`` and ``p95_nm`` are set to the search distance if no edge has a partner, because
-    measured and predicted edges are at least that far apart. They are set to 0 if neither map has an edge.
+    For films, ``mean_nm`` and ``p95_nm`` always have values. If no edge has a partner, both are set to the
+    search distance, because measured and predicted edges are at least that far apart. If neither map has an
+    edge, both are set to 0.
     """
     measured_um = prediction_um + residual_um
     if scan.seen_by != "sem":
@@ -174,9 +175,9 @@ def _contour(map_um: Array, height_um: float) -> _Contour:
 
 
 def _distance_px(of: _Contour, to: _Contour, search_px: float) -> Array:
-    """Return, for each piece of contour ``of``, the distance from its middle to the nearest piece of contour
-    ``to`` that rises to the same side. The distance is infinite if there is no such piece within
-    ``search_px``.
+    """For each piece of the contour ``of``, return the distance from its middle to the nearest piece of the
+    contour ``to``. Only pieces at which the map rises to the same side are compared. If there is none within
+    ``search_px``, the distance is infinite.
     """
     from scipy.spatial import KDTree
 

@@ -115,8 +115,8 @@ def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> 
 
 
 def one_sided_flip_p(values: Array) -> float:
-    """Return the one-sided p value of a sign-flip test: the share of combinations of signs for which the sum
-    of the values is at least the observed sum.
+    """Return the one-sided p value of a sign-flip test. It is the share of sign combinations that give at
+    least the observed sum of the values.
     """
     return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
@@ -151,8 +151,8 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Test whether the mean of a difference differs from zero by more than chance. ``differences_nm`` has one
-    value per scan. The independent units are scans. If ``groups`` states the print of each scan, the
+    """Test whether the mean of differences is farther from zero than chance explains. ``differences_nm`` has
+    one value per scan. The independent units are scans. If ``groups`` states the print of each scan, the
     independent units are prints.
 
     Raises:
@@ -183,8 +183,8 @@ class ByPrint(Record):
     Args:
         f: F statistic, i.e. the mean square between prints divided by the mean square within prints.
         degrees: degrees of freedom between prints and within prints.
-        icc: intraclass correlation, which is the share of the variance that scans of one print have in
-            common. A negative estimate is set to 0.
+        icc: intraclass correlation, which is the share of the variance that comes from differences between
+            prints. A negative estimate is set to 0.
         p: p value of a permutation test: the share of permutations of the scans for which ``f`` is at least
             as large as in the observed order. The observed order is one of the permutations.
     """

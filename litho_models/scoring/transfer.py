@@ -16,8 +16,8 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class LevelError(Record):
-    """The error at the pixels that are printed with one level: its mean (``bias_nm``) and its standard
-    deviation (``sd_nm``). ``scans`` is the number of scans in which the level occurs.
+    """The mean (``bias_nm``) and the standard deviation (``sd_nm``) of the error at all pixels of one layout
+    level. ``scans`` is the number of scans in which the level occurs.
     """
 
     level: int
@@ -28,8 +28,8 @@ class LevelError(Record):
 
 
 class TransferCurves(Record, extra="ignore"):
-    """The spectrum of the predicted height H compared with the spectrum of the measured height Z, along x and
-    along y: for each frequency, the gain |H·Z*| / |Z|² and the coherence γ².
+    """A comparison of the spectra of the predicted height H and the measured height Z, along x and along y.
+    It states the gain |H·Z*| / |Z|² and the coherence γ² at each frequency.
 
     ``error_psd_x`` and ``error_psd_y`` are the one-sided power spectral density of the error, nm² per
     cycle/µm. The mean of each line is removed first.
@@ -68,7 +68,7 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
     """Compute the gain, the coherence and the power spectral density of the error from the spectra of all
-    lines. The mean of each line is removed, and a Hann window is applied. Only measured pixels count.
+    lines. The mean of each line is removed, and a Hann window is applied. Only measured pixels are used.
 
     The frequency axis has ``TRANSFER_BANDS`` equal bands up to the Nyquist frequency of the layout pitch.
     """
@@ -101,9 +101,10 @@ def _band_powers(error: Array, prediction: Array, usable: Array, pitch_um: float
     The power spectral density is one-sided, in µm² per cycle/µm. Its sum divided by the number of terms is
     its mean.
 
-    ``error`` is measured minus predicted height, and 0 at pixels that are not usable. The power of the error
-    in a line is therefore proportional to the share of the line that is usable. The power of the prediction
-    and the number of terms are multiplied by the same share, so that unusable pixels do not bias the results.
+    ``error`` is measured minus predicted height, and 0 at pixels that are not usable. Therefore, if only a
+    share of a line is usable, the power of the error in this line is smaller by this factor. The power of the
+    prediction and the number of terms are multiplied by the same share, so that unusable pixels do not bias
+    the results.
     """
     window = np.hanning(error.shape[1])
     share = usable @ window**2 / np.sum(window**2)
