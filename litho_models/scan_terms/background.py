@@ -1,8 +1,8 @@
-"""The smooth background that appears in all scans of one microscope.
+"""Learn the smooth background that appears in all scans of one microscope.
 
 For example, levelling with planes leaves a bow in every scan. The part of the bow that is the same in every
-scan is learned from the training scans and added to predictions of *measured* maps. This background is not
-part of the printer and is not used in a design.
+scan is learned from the training scans and added to predictions of *measured* maps. This background does not
+belong to the printer, so designs do not use it.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class ScanPart(PrintedScan):
 
 
 class Background(Record):
-    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². The coefficients are
-    fitted to the training scans together. ``scans`` is the number of these scans; a part of a scan counts as
-    one.
+    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². One fit to all training
+    scans gives the coefficients. ``scans`` is the number of these scans, in which a part of a scan counts as
+    a whole scan.
 
     x and y run from -1 to 1 over a whole field whose size (y, x) is ``field_um``. Each term has zero mean, so
     a background does not change the datum.
@@ -72,9 +72,9 @@ def field_um(scan: PrintedScan) -> tuple[float, float]:
 
 
 def on_field(scan: PrintedScan, maps: Callable[[tuple[int, int]], FloatMap]) -> FloatMap:
-    """Evaluate maps of the whole field at the pixels of a scan, which may be a part of the field. ``maps`` is
-    a function that returns the maps for a given shape (ny, nx) of the field. The last two axes of the maps
-    are y and x.
+    """Evaluate maps of the whole field at the pixels of a scan, which may show only a part of the field.
+    ``maps`` is a function that takes the shape (ny, nx) of the field and returns its maps. The last two axes
+    of the maps are y and x.
     """
     if not isinstance(scan, ScanPart):
         return maps(scan.shape)
@@ -95,11 +95,11 @@ def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
     """Learn the smooth background that all scans show in addition to the heights that a model predicts.
 
-    All terms of policy ``full`` (offset, gain, tilt and bow) are fitted to the valid pixels of each scan. A
-    smooth surface over the whole field is then fitted to the tilts and bows of all scans at these pixels,
-    with a free offset for each scan. This surface is the background. If the scans are whole and fully
-    measured, the coefficients of this surface are the means of the coefficients of the scans. If the fields
-    of the scans differ in size, only the scans with the most frequent field size are used.
+    All terms of policy ``full`` (offset, gain, tilt and bow) are fitted to the valid pixels of each scan. The
+    background is one smooth surface over the whole field. It is fitted to the tilts and bows of all scans at
+    these pixels, with a free offset for each scan. If all scans show the whole field and are fully measured,
+    its coefficients are the means of the tilt and bow coefficients of the scans. If the fields of the scans
+    differ in size, only the scans with the most frequent field size are used.
 
     Args:
         scans: training scans.

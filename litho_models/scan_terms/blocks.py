@@ -1,10 +1,10 @@
 """Divide the pixels of a scan into pixels to which terms are fitted and pixels that are scored.
 
 If terms were fitted to the scored pixels, a model would look better than it is. Smooth terms are therefore
-fitted to one half of a checkerboard and subtracted from the other half. The offset of a line needs more
-separation, because it is estimated from few pixels, and because the roughness of neighbouring pixels is
-correlated. (Along x, the correlation is still 0.2 at a distance of 32 px.) If a line is scored on one side of
-the scan, its offset is therefore fitted on the other side, beyond a gap.
+fitted to one half of a checkerboard and subtracted from the other half. For the offset of a line, fitted and
+scored pixels must be farther apart, because the offset is estimated from few pixels with correlated
+roughness. (Along x, the correlation is still 0.2 at a distance of 32 px.) Therefore, to score a line on one
+side of the scan, its offset is fitted on the other side, beyond a gap.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class Blocks(NamedTuple):
 
 
 class Half(NamedTuple):
-    """Two masks of shape (ny, nx). With them, one colour of the checkerboard is scored, and terms are fitted
-    to the other colour. ``score`` is True at all pixels of the scored colour. ``calibrate`` is True at those
-    pixels of the other colour that are far enough from the scored pixels.
+    """Two masks of shape (ny, nx), for scoring one colour of the checkerboard and fitting terms to the other
+    colour. ``score`` is True at all pixels of the scored colour. ``calibrate`` is True at those pixels of the
+    other colour that are far enough from the scored pixels.
     """
 
     calibrate: BoolMap
@@ -55,9 +55,9 @@ class Half(NamedTuple):
 class Cell(NamedTuple):
     """A part of the scan that is scored, and the pixels to which the line offsets for this part are fitted.
 
-    ``score`` is the mask of the scored part. For lines that run along ``axis``, ``other_side[axis]`` is the
-    mask of the pixels on the other side of the scan, to which the offsets of these lines are fitted. All
-    masks have shape (ny, nx).
+    ``score`` is the mask of the scored part. ``other_side[axis]`` is the mask of the pixels to which the
+    offsets of lines along ``axis`` are fitted. These pixels lie on the other side of the scan. All masks have
+    shape (ny, nx).
     """
 
     score: BoolMap
@@ -84,9 +84,9 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
 
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:
-    """Cut the scan into parts, across its lines. If all lines run along the same axis, the parts are two
-    halves. If there are lines along both axes, the parts are four quadrants. Without lines, there is one
-    part, the whole scan.
+    """Divide the scan into parts by cuts across its lines. If all lines run along the same axis, the parts
+    are two halves. If there are lines along both axes, the parts are four quadrants. Without lines, there is
+    one part, the whole scan.
 
     Args:
         shape: shape (ny, nx) of the scan.
@@ -107,7 +107,7 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
 
 
 def thinned(used: BoolMap, count: int) -> NDArray[np.intp]:
-    """Return the flat indices of about ``count`` used pixels that lie on a square lattice."""
+    """Select about ``count`` of the used pixels, on a square lattice, and return their flat indices."""
     stride = max(1, round((used.sum() / count) ** 0.5))
     lattice = np.zeros_like(used)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True

@@ -2,8 +2,8 @@
 from the scored pixels.
 
 The datum and the bow of a scan contain no information about the printer, so the error of a model may be
-stated after such terms have been subtracted. In this project, ``cross_fit`` computes all errors that are
-stated in this way.
+stated after such terms have been subtracted. In this project, all such errors are computed with
+``cross_fit``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class CrossFit:
         residual_um: measured height minus predicted height minus terms, µm, of shape (ny, nx). It is NaN at
             pixels that are not scored.
         degrees_of_freedom: effective number of fitted terms, averaged over the scored parts of the scan. Line
-            offsets are shrunk towards zero, and each of them counts with its shrinkage weight (0 to 1).
+            offsets are shrunk towards zero, and each of them counts as a fraction of a term, which is its
+            shrinkage weight (0 to 1).
     """
 
     residual_um: FloatMap
@@ -49,8 +50,9 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Return the residual of a scan after its terms have been subtracted. The terms are fitted to pixels that
-    are not scored. Fitted and scored pixels then change places, so that every valid pixel is scored.
+    """Return the residual of a scan after its terms have been subtracted. The terms are fitted to one part of
+    the pixels and subtracted from the other part, which is scored. The two parts then change places, so that
+    every valid pixel is scored.
 
     Args:
         height_um: measured height, µm, of shape (ny, nx). It may be NaN at pixels that are not valid.
@@ -128,9 +130,8 @@ def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, te
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Return the coefficients for which the weighted sum of the rows of ``design`` fits ``target`` best in
-    the sense of least squares. ``design`` has shape (k, n), ``target`` has shape (n, …), and the result has
-    shape (k, …).
+    """Fit ``target`` by a weighted sum of the rows of ``design`` with least squares, and return the weights.
+    ``design`` has shape (k, n), ``target`` has shape (n, …), and the result has shape (k, …).
     """
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 

@@ -1,5 +1,5 @@
-"""Ridge regression over scans. The strength (coefficient) of each column (regressor) is either the same in
-all scans or differs between groups of scans.
+"""Ridge regression over scans. The regressors are called columns, and their coefficients are called
+strengths. A strength is either the same in all scans or differs between groups of scans.
 
 The regression needs only the inner products of the residual and the columns of each scan. From these
 products, it can compute the best-fitting strengths for any selection of scans, and the squared error that
@@ -56,13 +56,13 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     """Return all groupings of the scans, keyed by name, with ``all`` first. Each grouping is a tuple of
     labels, one per scan, in the order of ``scans``.
 
-    Groupings are derived from the dataset card, which states the print, tip, direction and rotation of each
-    scan and may state further groups. If all scan ids have the same length, groupings are also derived from
+    Groupings are derived from the dataset card. It states the print, tip, direction and rotation of each
+    scan, and may define further groups. If all scan ids have the same length, groupings are also derived from
     the ids: for each position in the id, scans with the same character at this position form a group. With
-    ``by_order``, groupings are also derived from the printing order. Such a grouping has two groups: the
-    scans before and the scans after a position at which something may have changed. Any other grouping,
-    except ``all``, must have at least two labels, and at least half of its labels must have two or more
-    scans. If two groupings divide the scans in the same way, only the first is used.
+    ``by_order``, groupings are also derived from the printing order. Such a grouping divides the scans into
+    those before and those after a position at which something may have changed. Any other grouping, except
+    ``all``, must have at least two labels, and at least half of its labels must have two or more scans. If
+    two groupings divide the scans in the same way, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -119,14 +119,14 @@ _ALIKE = 1e-7
 
 @dataclass(frozen=True)
 class Block:
-    """Columns with the same grouping of their strengths and the same prior.
+    """A set of columns whose strengths share one grouping and one prior.
 
     Attributes:
         columns: indices of the columns in the inner products, counted from 1, because index 0 is the
             residual.
         by: name of the grouping. Each label of the grouping has separate strengths.
-        shrinking: weight of the prior that the strengths are zero, stated as a number of scans. If the weight
-            is 0, there is no prior.
+        shrinking: weight of the prior, which pulls the strengths towards zero. The weight is a number of
+            scans. If it is 0, there is no prior.
     """
 
     columns: tuple[int, ...]
@@ -149,13 +149,11 @@ class Products:
 
     @classmethod
     def ungrouped(cls, grams: np.ndarray) -> Products:
-        """Make products for scans that are not divided into groups, so that every column has a single
-        strength for all scans.
-        """
+        """Make products for scans without groups. Every column then has a single strength for all scans."""
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the best-fitting strengths for the scans with the given indices. The result is a list with
+        """Fit the strengths to the scans with the given indices, and return them. The result is a list with
         one dictionary per block. Each dictionary maps a label to an array of strengths, of shape (columns,).
 
         Labels that do not occur among these scans are absent from the dictionaries.
@@ -168,8 +166,8 @@ class Products:
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
         """Return the mean squared residual of each scan with the given indices, after the columns of the
-        blocks have been subtracted. Each column is first multiplied by its strength in the group to which the
-        scan belongs. The result has shape (scans,).
+        blocks have been subtracted. Before the subtraction, each column is multiplied by its strength in the
+        group to which the scan belongs. The result has shape (scans,).
 
         If a block has no strengths for the label of a scan, the block is not subtracted from this scan.
         """
@@ -199,13 +197,12 @@ class Products:
         return left
 
     def freed_of(self, blocks: Sequence[Block]) -> Products:
-        """Fit the given blocks to all scans, and project them out of the residual and of the other columns.
-        Return the new products.
+        """Fit the columns of the given blocks to the residual and to every other column, in all scans.
+        Subtract these fits, and return the products of what remains.
 
         The columns of the blocks become zero. If the strengths of other columns are the same in all scans, a
         later fit of these columns gives the same result as a joint fit with the blocks. If these strengths
-        differ by group, the two results agree only if the part that was projected out is the same in all
-        groups.
+        differ by group, the two results agree only if the subtracted part is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -229,8 +226,9 @@ class _Expanded:
     Attributes:
         columns: indices of the columns of all blocks.
         rows: for each block and label, the row numbers of its strengths.
-        alike: sets of scans whose labels agree in the groupings of all blocks. Each set is given as a pair:
-            the indices of its scans, and the row numbers of their strengths in the order of ``columns``.
+        alike: sets of scans that have the same labels in the groupings of all blocks. Each set is a pair. It
+            contains the indices of the scans, and the row numbers of their strengths in the order of
+            ``columns``.
     """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):

@@ -39,8 +39,8 @@ def scan_line_index(
 
 
 def axis_along(line: LineIndex) -> int:
-    """Return the array axis along which the lines run. It is 1 for lines along x. It is 0 for lines along y,
-    which occur in scans that are rotated by 90 degrees.
+    """Return the array axis along which the lines run. It is 1 for lines along x, and 0 for lines along y.
+    Lines along y occur in scans that are rotated by 90 degrees.
     """
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
     return 1 if down >= across else 0
@@ -50,7 +50,7 @@ def shrunk_line_offsets(
     residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
 ) -> tuple[FloatMap, FloatMap, float]:
     """Estimate the height offset s_i of each line. The offsets are treated as random effects with s_i ~ N(0,
-    v), and their best linear unbiased prediction (BLUP) is returned.
+    v). The estimate is their best linear unbiased prediction (BLUP).
 
     Each line is divided into blocks. The noise variance of a line mean is estimated from the scatter of the
     block means within the lines. This estimate holds even if the noise is correlated along the line. The

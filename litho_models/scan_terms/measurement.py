@@ -1,5 +1,5 @@
 """The measurement model. It describes how the microscope, the registration and the levelling change the
-height map. Only changes that several scans have in common are included.
+height map of a print. It includes only changes that several scans have in common.
 
 In a scan, the image of the print is displaced by the uneven motion of the scanner, multiplied by a gain,
 levelled, and added to a background. Some of these changes are the same in all scans or in all scans of a
@@ -43,13 +43,14 @@ class SharedPart(Record):
     """One part of the measurement model: a background, a displacement or a gain that several scans share.
 
     Attributes:
-        what: kind of the part. A background or a displacement is a sum of products of Legendre polynomials of
-            x and y up to the total ``degree``, where x and y run from -1 to 1 over the field. A gain is a
-            single number, the relative change of the height.
+        what: kind of the part. A background or a displacement is a sum of terms. Each term is a product of
+            Legendre polynomials of x and of y, with a total degree of at most ``degree``. The coordinates x
+            and y run from -1 to 1 over the field. A gain is a single number, the relative change of the
+            height.
         by: name of the grouping whose groups have separate coefficients.
         coefficients: coefficients for each label of the grouping, in µm. For a gain, there is one
             dimensionless coefficient. A part without coefficients changes nothing.
-        shrinking: weight, in the fit, of the prior that the coefficients are zero. The weight is stated as a
+        shrinking: weight of the prior, which pulls the coefficients towards zero in the fit. The weight is a
             number of scans.
     """
 
@@ -82,8 +83,8 @@ class MeasurementModel(Record):
     """The changes that the measurement makes to several scans in the same way.
 
     Attributes:
-        levelling: kind of surface that was fitted to whole scan files and subtracted from them. The same kind
-            of surface is subtracted from predictions.
+        levelling: kind of surface that is assumed to have been fitted to whole scan files and subtracted. The
+            same kind of surface is fitted to predictions and subtracted from them.
         parts: the changes other than the levelling, in the order in which they were found.
         field_um: size (y, x) of the fields of the training scans, µm.
         scans: number of training scans.
@@ -106,8 +107,8 @@ class MeasurementModel(Record):
         return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
-        """Return the map that the scan is expected to show, given the predicted height of the print. Both
-        maps have shape (ny, nx) and are in µm.
+        """From the predicted height of the print, return the map that the scan is expected to show. Both maps
+        have shape (ny, nx) and are in µm.
 
         If the field of the scan differs in size from the fields of the training scans, only the levelling is
         applied.
@@ -127,8 +128,8 @@ class MeasurementModel(Record):
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
-        """Return a model that contains only the differences between groups. To obtain them, the mean over all
-        labels is subtracted from the coefficients of each part.
+        """Return a model that contains only the differences between groups. From the coefficients of each
+        part, the mean over all labels is subtracted.
 
         The levelling and the parts that are the same in all scans are left out. Gains are left out, too,
         because a difference in gain between prints may come from the printer.
@@ -153,8 +154,8 @@ class MeasurementModel(Record):
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Displace a predicted height map. Of the given parts, only the displacements are used. The height map
-    and the result have shape (ny, nx) and are in µm.
+    """Displace a predicted height map. Parts that are not displacements are ignored. The height map and the
+    result have shape (ny, nx) and are in µm.
     """
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
@@ -168,9 +169,7 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
-    """Subtract from a height map the surface of the given kind that fits its usable pixels best. The mean of
-    the surface is not subtracted.
-    """
+    """Fit a surface of the given kind to the usable pixels of a height map. Subtract it without its mean."""
     if levelling == "none":
         return field
     shapes = polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]

@@ -1,5 +1,5 @@
-"""Learn the measurement model: choose its parts, which are changes that several scans have in common, and fit
-their coefficients.
+"""Learn the measurement model. Its parts are changes that several scans have in common. The module chooses
+the parts and fits their coefficients.
 
 A part is, for example, a background or a displacement that is the same in all scans of a group. Parts are
 chosen by cross-validation within the given scans.
@@ -45,7 +45,7 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights to try for the prior that the coefficients of every group are zero. A weight is stated as a number
+# Weights to try for the prior that pulls the coefficients of every group towards zero. A weight is a number
 # of scans. The ideal weight is the variance within groups divided by the variance between groups.
 _SHRINKING = (0.3, 1.0, 3.0)
 # A part is added only if the squared error on held-out scans falls by more than ``_LEAST_Z`` standard errors
@@ -153,12 +153,13 @@ def _fitted(products: Products, chosen: Sequence[SharedPart]) -> list[SharedPart
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """Return the residual of a scan (first row) and the m columns of all parts (further rows) at a thinned
-    set of n pixels. The mean of each row is subtracted. The result has shape (1 + m, n).
+    """Return an array whose first row is the residual of a scan. The other rows are the m columns
+    (regressors) of all parts that may be tried. The values are taken at a thinned set of n pixels, and the
+    mean of each row is subtracted. The result has shape (1 + m, n).
 
     The contribution of the parts that are already in ``model`` is added back to the residual, to first order.
-    Each round therefore fits the full coefficients and not corrections to them, so the prior shrinks the
-    coefficients only once, regardless of the number of rounds.
+    Each round therefore fits the full coefficients and not corrections to them. As a result, the prior
+    shrinks the coefficients only once, however many rounds there are.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
@@ -194,8 +195,8 @@ def _block(part: SharedPart) -> Block:
 
 
 def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
-    """Choose the levelling for which the predictions fit the scans best, after the bow and tilt that all
-    scans share are removed.
+    """Choose the levelling with which the predictions fit the scans best. The bow and tilt that all scans
+    share are first removed.
     """
     rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}
     for scan, prediction in pairs:

@@ -49,8 +49,8 @@ def usual_policy(film: bool) -> Policy:
 
 
 def usual_background(film: bool) -> BackgroundUse:
-    """Return which background is added to predictions by default: the background of the training scans, or
-    none for films.
+    """Return which background is added to predictions by default. It is the background of the training scans;
+    for films, there is none.
     """
     return "none" if film else "training"
 
@@ -59,11 +59,11 @@ class NuisanceProtocol(Record):
     """The terms that are subtracted from scans before scoring, and the pixels to which they are fitted.
 
     ``k`` is the number of smooth terms per scan. It does not include the line offsets of policy
-    ``full+rows``. ``PolicyError.k`` also counts the line offsets, whose effective number depends on the
-    prediction. ``background`` is ``training`` if the scored predictions include the smooth background of the
-    training scans, ``shared`` if they include the whole measurement model, and ``none`` if they include
-    neither. No part of the background is fitted to the scored scan. ``border_px`` is the number of pixels
-    that are left out at the edge of a scan; it is always zero. The other fields are explained at ``Blocks``.
+    ``full+rows``. ``PolicyError.k`` also includes their effective number, which depends on the prediction.
+    ``background`` is ``training`` if the scored predictions include the smooth background of the training
+    scans, ``shared`` if they include the whole measurement model, and ``none`` if they include neither. No
+    part of the background is fitted to the scored scan. ``border_px`` is the number of pixels that are left
+    out at the edge of a scan; it is always zero. The other fields are explained at ``Blocks``.
     """
 
     policy: Policy = "offset"
@@ -77,7 +77,7 @@ class NuisanceProtocol(Record):
 
     @classmethod
     def of_policy(cls, policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
-        """Return the standard protocol of a policy."""
+        """Return the protocol of a policy, with the standard blocks."""
         k = float(len(parameter_names(policy_terms(policy))))
         return cls(policy=policy, k=k, background=background, **Blocks(seed=seed)._asdict())
 
@@ -93,8 +93,8 @@ PINNED: Terms = frozenset({"offset", "gain"})
 
 
 def training_terms(policy: Policy) -> Terms:
-    """Return the terms of a policy that are fitted to each scan while a model is trained: all except the
-    gain.
+    """Return the terms that are fitted to each scan while a model is trained. They are all terms of the
+    policy except the gain.
 
     Part of the gain of a scan is a long-range effect of the layout. A model cannot learn this effect if the
     gain of every scan is free.

@@ -46,8 +46,8 @@ class TermPixels:
 
     @cached_property
     def slopes(self) -> tuple[FloatMap, FloatMap]:
-        """Return the change of the predicted height per pixel along y and along x, µm, at the n pixels. The
-        result is a pair of arrays of shape (n,).
+        """Return the change of the predicted height per pixel along y and along x, µm, at the n pixels. Each
+        of the two arrays has shape (n,).
         """
         slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
         return self._taken(slopes[0]), self._taken(slopes[1])
@@ -88,7 +88,7 @@ class ScanTerm:
         lines: function that returns the line index of each pixel, for line offsets only. It is called as
             ``lines(shape, scan_line)`` with the shape of the scan and the index of the scan line of each
             pixel (or None).
-        frame: name of the lines that have an offset each, such as "the scan lines"; for line offsets only.
+        frame: what the lines are called, such as "the scan lines"; for line offsets only.
     """
 
     name: str
@@ -135,7 +135,7 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
 
 
 def line_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """From the named terms, return the line offsets."""
+    """Return those of the named terms that are line offsets."""
     return [term for term in chosen_terms(names) if term.lines is not None]
 
 
@@ -179,7 +179,7 @@ def row_index(shape: tuple[int, ...]) -> LineIndex:
 
 
 def _drift(pixels: TermPixels) -> FloatMap:
-    """Return maps of exponential creep after the start of the scan, one for each decay time."""
+    """Return one map for each decay time. It shows an exponential creep that starts with the scan."""
     time = pixels.time
     ends = TermPixels(pixels.prediction_um, pixels.line).time if pixels.at is not None else time
     return np.stack([np.exp(-time / d) - np.exp(-ends / d).mean() for d in CREEP_DECAYS.values()])
@@ -200,7 +200,7 @@ def _distortion(pixels: TermPixels) -> FloatMap:
 
 
 # Decay times of the two parts of a creep, relative to the duration of a scan. Creep that is slower than both
-# cannot be distinguished from the bow and is treated as part of it.
+# parts cannot be distinguished from the bow and is treated as part of the bow.
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
 # The terms are listed in the order in which the loop tests them.
