@@ -1,4 +1,5 @@
-"""Train and score several models on one dataset, by cross-validation under one protocol.
+"""Train and score several models on one dataset by cross-validation. All models are scored with the same
+protocol.
 
 Every finished fit is cached. If a benchmark is interrupted or extended, only the missing fits are computed.
 """
@@ -61,15 +62,17 @@ def benchmark(
     Args:
         store: dataset store.
         out: result folder; ``out/cache`` keeps every fit.
-        split: ``grouped`` (whole scans are held out), ``leave-one-print-out``, or ``paper`` (one random 75/25
-            split of the quadrants of all scans). With ``paper``, the training set and the test set contain
-            parts of the same scans, so errors are underestimated. Use it only for comparison with the paper.
+        split: ``grouped`` (whole scans are held out), ``leave-one-print-out``, or ``paper`` (a random choice
+            of 75 % of the quadrants of all scans for training; the other quadrants are scored). With
+            ``paper``, the training set and the test set contain parts of the same scans, so errors are
+            underestimated. Use it only for comparison with the paper.
         models: names of the models to compare.
-        settings: values for fields of ``TrainingConfig``, which replace the values of the recipe.
-        folds: number of folds of the split ``grouped``. If there are fewer printed fields that are not
-            locked, each of these fields is a fold.
-        first_folds: fit and score only this number of folds, for a quick comparison of seeds or settings; by
-            default all folds.
+        settings: values for fields of ``TrainingConfig``. They replace the values that the training recipe
+            sets.
+        folds: number of folds of the split ``grouped``. If the number of printed fields outside the lock box
+            is smaller, each of these fields is a fold.
+        first_folds: number of folds that are fitted and scored; by default all folds. A smaller number allows
+            a quick comparison of seeds or settings.
         policy: name of a set of nuisance terms, which are fitted to each scan before ``mae_datum_free_nm`` is
             computed; by default ``offset``, or ``none`` for films.
         background: ``training``, ``shared`` or ``none``; by default ``training``, or ``none`` for films. With

@@ -40,10 +40,11 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    A scan counts as locked if this store locks it, or if it was locked when the model was trained. If the
-    model was trained on this store, or if scans of this store were locked when the model was trained, locked
-    scans are scored only if ``open_lock_box`` is set. In all other cases, all scans are scored. The result
-    states which scans are locked and whether any of them was scored.
+    A scan counts as locked if it is in the lock box of this store, or if it was locked when the model was
+    trained. Locked scans are left out in two cases: the model was trained on this store, or scans of this
+    store were locked when the model was trained. With ``open_lock_box``, locked scans are scored too. In all
+    other cases, all scans are scored. The result states which scans are locked and whether any of them was
+    scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -56,12 +57,14 @@ def evaluate(
             this size, none is added, and the result states the background ``none``.
         noise: path of the ``noise.json`` of this dataset, or of the folder with this file. The noise floor in
             this file is shown beside the errors.
-        extrapolate: accept layouts with heights outside the calibrated range that the model's card states.
+        extrapolate: also accept layouts with heights outside the calibrated range, which the model's card
+            states.
         open_lock_box: also score locked scans that would otherwise be left out.
 
     Raises:
         InputError: the model or the store cannot be read, their pitch or level height differs, no scan is
-            left to score, the noise analysis belongs to other data, or the background is not a known one.
+            left to score, the noise analysis belongs to another dataset, or the name of the background is
+            unknown.
     """
     dataset = open_store(store)
     film = dataset.instrument == "sem"

@@ -35,8 +35,8 @@ from litho_models.splits.folds import Fold
 class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training, validation and held-out scans.
 
-    Each error is the datum-free error, with the policy ``offset`` and without a background, averaged over
-    scans. The three errors are computed in the same way, so differences between them show over-fitting.
+    All three are datum-free errors with the policy ``offset`` and without a background, averaged over scans.
+    Because they are computed in the same way, differences between them show over-fitting.
     ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the measurement model
     that was learned with the fit, or None if there is none.
     """
@@ -52,8 +52,8 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(FitFacts):
-    """The record of one fit: its scans, its duration, and its errors, nm, after each training step that
-    ``steps`` lists. A validation error is None if there are no validation scans.
+    """The record of one fit. It contains the scans, the duration, and the errors, nm, at the training steps
+    listed in ``steps``. A validation error is None if there are no validation scans.
     """
 
     model: str
@@ -73,10 +73,9 @@ def fit_or_load(
     fit and the heights, µm, that it predicts for the held-out scans, as one array of shape (ny, nx) per scan.
 
     Args:
-        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. This
-            model is learned from the residuals of a first fit. The contribution that it predicts is
-            subtracted from the training scans, and the fit is repeated. Then the measurement model is learned
-            again.
+        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. It
+            is learned from the residuals of a first fit. What it predicts is subtracted from the training
+            scans, and the fit is repeated. Then the measurement model is learned again.
 
     Raises:
         InputError: the cached fit cannot be read.
@@ -106,9 +105,9 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the predicted scan. With the background ``training`` or ``shared``, the predicted height is
-    combined with the background or the measurement model that was learned from the training scans of the fit.
-    With ``none``, it is returned alone.
+    """Return the predicted scan. With ``training``, the predicted height is combined with the background that
+    was learned from the training scans of the fit. With ``shared``, it is combined with the measurement model
+    that was learned from them. With ``none``, the prediction contains only the height.
     """
     found = record.diagnostics
     if background == "none":

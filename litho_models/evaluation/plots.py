@@ -23,9 +23,9 @@ Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
 
 def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line: bool) -> Figure:
-    """Draw two errors of each model with their confidence intervals: the error with nothing fitted to the
-    scans, and the error after terms are fitted to each scan. Lines mark the noise floor and the error
-    reported in the paper.
+    """Draw two errors of each model with their confidence intervals. One is the error with nothing fitted to
+    the scans, and the other is the error after terms are fitted to each scan. Lines mark the noise floor and
+    the error reported in the paper.
     """
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
     axes = figure.subplots()
@@ -143,8 +143,8 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
-    """Draw one panel for each label. A panel shows one solid line per model. If the function of the panel
-    returns a second list of y values, a dashed line shows these values.
+    """Draw one panel for each label. A panel shows one solid line per model. ``panels`` contains a function
+    for each label. If this function returns a second list of y values, a dashed line shows these values.
     """
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
     grid = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -67,16 +67,17 @@ class Benchmark(Result):
 
 
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
-    """Compare the leading errors of two results, scan by scan: the datum-free mean absolute error or, for
-    films, the mean shift of the edges. Each result is a ``benchmark.json`` or an ``evaluation.json``.
+    """Compare the leading errors of two results, scan by scan. The leading error is the datum-free mean
+    absolute error or, for films, the mean shift of the edges. Each result is a ``benchmark.json`` or an
+    ``evaluation.json``.
 
-    Each model that both results contain is compared between the two results. If each result contains only one
-    model, these two models are compared, even if their names differ. A negative difference means that the
-    model of the first result is better.
+    For every model in both results, its errors in the first and in the second result are compared. If each
+    result contains only one model, these two models are compared, even if their names differ. A negative
+    difference means that the model of the first result is better.
 
     Raises:
         InputError: a file cannot be read; the results differ in data, split, scored scans, nuisance terms or
-            background; the model of only one of the results was trained on scored scans; or there are no
+            background; one result contains errors on training scans, but the other does not; or there are no
             models to compare.
     """
     import pandas as pd

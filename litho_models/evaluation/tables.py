@@ -26,9 +26,9 @@ def headline_table(
     """Return the main table of a report. Each row states the two errors of one model with their confidence
     intervals, the excess over the noise floor, the RMS error and the bias.
 
-    The last row is the noise floor. In each column, it is computed with the same per-scan terms as the errors
-    of the models. For films, the table lists the errors of edges and features instead of height errors, and
-    it has no noise floor.
+    The last row is the noise floor. Each value of the floor is computed with the same per-scan terms as the
+    errors in its column. For films, the table lists the errors of edges and features instead of height
+    errors, and it has no noise floor.
     """
     import pandas as pd
 
@@ -77,9 +77,9 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
     """Return a table of mean absolute errors. There is one column for each policy (set of per-scan terms).
-    Each model has one row with the background of the protocol. If there is a background, a second row states
-    the errors without it. For the policy with line offsets (``full+rows``), a second column states the
-    effective number of terms per scan.
+    Each model has one row of errors with the background of the protocol. If there is a background, a second
+    row states the errors without it. For the policy with line offsets (``full+rows``), a second column states
+    the effective number of terms per scan.
 
     The last row is the noise floor for each policy.
     """

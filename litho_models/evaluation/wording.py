@@ -6,14 +6,14 @@ from litho_data.reports.page import filled
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.scoring.records import ModelScores
 
-# A difference counts as more than chance if its confidence interval excludes zero and the p value of its
+# Chance does not explain a difference if its confidence interval excludes zero and the p value of its
 # sign-flip test is at most this value.
 _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """Return sentences that state which model predicts best, by how much it is better than the second-best
-    model, whether this difference is more than chance, and how large the noise floor is.
+    """Return sentences that state which model predicts best, how much worse the second-best model is, whether
+    chance explains this difference, and how large the noise floor is.
 
     If the scans come from several prints, the test of the difference treats prints instead of scans as
     independent.

@@ -2,15 +2,15 @@
 false alarms.
 
 The test makes one comparison for each new print. The comparison for a print assumes that the mean changes in
-a step at this print and stays changed until the last print. The values before the step, which include those
-of the reference prints, are compared with the values after it by a t test with a pooled spread. Although the
-mean and the spread must be estimated from the prints, Student's t distribution is exact for any number of
-reference prints. The method is the likelihood-ratio test for a step in the mean with unknown parameters
-(Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of false alarms is divided among the
-comparisons (Bonferroni). All comparisons together therefore have this rate at most, even if they are
-correlated. A step should be noticed within ``SOON`` prints, so comparisons with at least ``SOON`` prints
-after the step get most of the rate. With three new prints, the test is nearly a t test of the mean of these
-three prints, which is the best possible test if the spread is unknown.
+a step at this print and stays changed until the last print. A t test with a pooled spread compares the values
+before the step, including all reference prints, with the values after the step. Although the mean and the
+spread must be estimated from the prints, Student's t distribution is exact for any number of reference
+prints. The method is the likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu
+and Kang 2003, J. Quality Technology 35, 355). The rate of false alarms is divided among the comparisons
+(Bonferroni). The rate of all comparisons together is therefore not exceeded, even if they are correlated. A
+step should be noticed within ``SOON`` prints, so comparisons with at least ``SOON`` prints after the step get
+most of the rate. With three new prints, the test is nearly a t test of the mean of these three prints, which
+is the best possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -33,8 +33,8 @@ _LARGEST = 1e4
 
 class Series(NamedTuple):
     """The value of a monitored quantity for each of n reference prints and m new prints, in printing order,
-    and the relative variances of these values. A relative variance is a variance divided by an unknown
-    factor, which is the same for all prints.
+    and the relative variances of these values. The variances are known only up to a factor that is the same
+    for all prints. A relative variance is a variance divided by this factor.
 
     Attributes:
         reference: values of the reference prints, with shape (..., n).
@@ -73,11 +73,11 @@ def shares(new_prints: int) -> Array:
 
 
 def step_statistics(series: Series) -> tuple[Array, Array]:
-    """For every new print, return the size of a step at this print and the standard error of this size. Both
-    arrays have shape (m, ...).
+    """For every new print, assume that the mean changes in a step at this print. Return the sizes of these
+    steps and their standard errors. Both arrays have shape (m, ...).
 
-    If nothing has changed, the ratio of step to standard error follows Student's t with n + m - 2 degrees of
-    freedom.
+    If nothing has changed, the size divided by its standard error follows Student's t with n + m - 2 degrees
+    of freedom.
     """
     weight = 1 / np.concatenate([series.reference_variance, series.new_variance])
     # The reference mean is subtracted first, because sums of squares of large values would lose digits.
@@ -111,8 +111,8 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
-    """Return the probability that a rise of the mean raises an alarm within ``SOON`` prints, or within all
-    new prints if there are fewer.
+    """Return the probability that a rise of the mean is noticed, i.e. raises an alarm within ``SOON`` prints.
+    If there are fewer new prints, the alarm may come within all of them.
 
     The result is a lower bound, because only one comparison is considered: the step is assumed at the first
     print after the rise. The statistic of this comparison has a noncentral t distribution. All values are
@@ -130,8 +130,8 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
     """Return the size of a step that raises an alarm with probability ``power``, in units of the spread of a
-    print whose relative variance is 1. The result is infinite if the step exceeds ten thousand standard
-    errors. The other arguments have the same meaning as in ``chance_to_notice``.
+    print whose relative variance is 1. The result is infinite if this step exceeds ten thousand standard
+    errors. All arguments except ``power`` have the same meaning as in ``chance_to_notice``.
     """
     error = _comparison(reference_variance, new_variance, rate)[2]
 
@@ -142,8 +142,9 @@ def noticeable_step(reference_variance: Array, new_variance: Array, rate: float,
 
 
 def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
-    """For the comparison of the last ``SOON`` prints with all prints before them, return the value of t above
-    which an alarm is raised, the degrees of freedom of t, and the standard error of the step.
+    """Return three numbers for the comparison of the last ``SOON`` prints with all prints before them. They
+    are the value of t above which an alarm is raised, the degrees of freedom of t, and the standard error of
+    the step.
     """
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)

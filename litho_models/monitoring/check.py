@@ -28,20 +28,21 @@ def check(
     false_alarms: float = DEFAULT_RATE,
     tolerance: float | None = None,
 ) -> Check:
-    """Test whether a printer has changed, by comparing new prints with reference prints. Each print is first
-    compared with the prediction of a model. Write ``check.json``, a report and tables.
+    """Test whether a printer has changed. Every print is compared with the prediction of a model. The results
+    for new prints are then compared with the results for reference prints. Write ``check.json``, a report and
+    tables.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store of the new prints. If the model was trained on prints of this store, the locked
             scans of the store are left out.
         out: result folder.
-        reference: store of prints that were made before any change of the printer. By default, the reference
-            is the values of the training prints, which are stored in the model's card.
+        reference: store of prints that were made before any change of the printer. By default, the values of
+            the training prints serve as reference. They are stored in the model's card.
         new: names of the new prints, if ``store`` also contains the reference prints. All other prints of the
             store are then reference prints.
-        false_alarms: probability of at least one alarm in all monitored quantities together if the printer is
-            unchanged.
+        false_alarms: probability that an unchanged printer causes an alarm in at least one monitored
+            quantity.
         tolerance: largest allowed relative drift of a monitored quantity (0.05 is 5 %); by default three
             times the spread of the quantity.
 

@@ -24,8 +24,8 @@ _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
-    """The monitored values of the reference scans and of the new scans. ``dropped`` lists the excluded scans
-    with the reasons for their exclusion, and ``words`` describes the reference in words.
+    """The monitored values of the reference scans and of the new scans. ``dropped`` lists the excluded scans,
+    each with the reason. ``words`` is a text that describes the reference.
 
     ``between`` is True if new prints may have been made between reference prints.
     """
@@ -127,9 +127,8 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """Keep only the scans that have the most frequent dose of the reference scans. Scans with another dose
-    are excluded, because their dose was changed on purpose and the gain depends on the dose. Scans that state
-    no dose are kept.
+    """Keep only the scans at the dose that is most frequent among the reference scans. At another dose, which
+    was set on purpose, the gain is different, so these scans are excluded. Scans that state no dose are kept.
     """
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:

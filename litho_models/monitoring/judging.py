@@ -1,4 +1,4 @@
-"""Judge for each monitored quantity whether it has changed, and estimate when it should be measured again.
+"""For each monitored quantity, judge whether it has changed, and estimate when it should be measured again.
 The functions of this module work on values of scans and need neither files nor models.
 """
 
@@ -46,9 +46,9 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     reach the tolerance.
 
     The drift is the slope of the trend times the number of prints since the model was made. The model is
-    assumed to have been made at the middle of the reference prints. For the 95 % bound on the drift, the
-    slope is set to the steeper end of its confidence interval. The forecast assumes a steady drift. It does
-    not include sudden steps, because they raise an alarm.
+    assumed to have been made at the middle of the reference prints. The 95 % bound on the drift is computed
+    with the steeper end of the slope's confidence interval. The forecast assumes a steady drift. Sudden steps
+    are not included, because they raise an alarm.
 
     Args:
         values: one value per print in printing order, with shape (n,); at least three.

@@ -1,5 +1,5 @@
-"""The record ``check.json`` and the monitored quantities. A quantity has one value per print. This module
-also computes the spread of these values between prints.
+"""Define the record ``check.json`` and the monitored quantities. A quantity has one value per print. The
+module also computes how much these values differ from print to print.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +21,8 @@ class Figure(NamedTuple):
 
     ``words`` is the name of the quantity in sentences, and ``causes`` lists what may change it. ``of`` is a
     function that returns the logarithm of the quantity for one scan. Differences of logarithms are relative
-    changes: a step of 0.03 is 3 %. ``weight`` determines the share of the rate of false alarms that is
-    allotted to the quantity.
+    changes, so a step of 0.03 is 3 %. ``weight`` determines which share of the rate of false alarms the
+    quantity gets.
     """
 
     name: str
@@ -124,9 +124,9 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Compute the mean and the spread of a quantity over at least two prints. A one-way analysis of variance
     splits the variance into a part between prints and a part within prints.
 
-    The two parts are needed because a mean over several scans of a print varies less than the value of a
-    single scan. The part within prints is known only if some prints have several scans. A negative estimate
-    of the variance between prints is set to 0.
+    Both parts are needed, because a mean over several scans of a print varies less than the value of a single
+    scan. The variance within prints is known only if some prints have several scans. A negative estimate of
+    the variance between prints is set to 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -165,15 +165,16 @@ class Alarm(Record):
 
 class FigureCheck(Record):
     """The comparison of new prints with reference prints in one monitored quantity. ``mean`` is the geometric
-    mean of the quantity. All other values of the quantity are relative: 0.01 is 1 %.
+    mean of the quantity. All other values of the quantity are relative differences (0.01 is 1 %).
 
     ``mean`` and ``spread`` describe the reference prints. ``p`` is an upper bound on the p value of a change.
     If ``p`` is at most ``alarm_at``, there is an alarm. ``alarm_at`` is the part of the rate of false alarms
     that is allotted to this quantity. ``noticeable_step`` is the rise r that raises an alarm with a
     probability of 90 % within three new prints, or within all new prints if there are fewer than three. A
-    fall by r/(1 + r) raises an alarm equally often. ``noticeable_step`` is None if the rise would exceed a
-    factor of e. ``trend`` is the change from print to print, fitted to all prints. ``measure_again_in`` is
-    the number of prints until the 95 % bound on the drift reaches ``tolerance``; after an alarm, it is 0.
+    fall by r/(1 + r) raises an alarm equally often. If the quantity would have to rise by more than a factor
+    of e, ``noticeable_step`` is None. ``trend`` is the change from print to print, fitted to all prints.
+    ``measure_again_in`` is the number of prints until the 95 % bound on the drift reaches ``tolerance``;
+    after an alarm, it is 0.
     """
 
     name: str

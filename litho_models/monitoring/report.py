@@ -54,10 +54,10 @@ def write_check_report(result: Check, out: str | Path, *, between: bool) -> Path
 
 
 def control_chart(result: Check, one: FigureCheck, *, between: bool) -> Figure:
-    """Draw one monitored quantity of all prints, relative to the mean of the reference prints. Large dots are
-    prints and small dots are scans. One band shows the spread of the reference prints. If there is an alarm,
-    another band marks each changed print. Dashed lines mark the tolerance. A dotted line separates reference
-    and new prints, unless new prints may have been made between reference prints.
+    """Draw one monitored quantity for all prints, relative to the mean of the reference prints. Large dots
+    are prints and small dots are scans. One band shows the spread of the reference prints. If there is an
+    alarm, another band marks each changed print. Dashed lines mark the tolerance. A dotted line separates
+    reference and new prints, unless new prints may have been made between reference prints.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -95,8 +95,8 @@ def control_chart(result: Check, one: FigureCheck, *, between: bool) -> Figure:
 
 
 def _relative(value: float | np.ndarray, one: FigureCheck) -> np.ndarray:
-    """Convert the logarithm of a quantity to the difference of the quantity from the mean of the reference
-    prints, in %.
+    """From the logarithm of a quantity, compute by how many per cent the quantity differs from the mean of
+    the reference prints.
     """
     return 100 * np.expm1(np.asarray(value) - np.log(one.mean))
 

@@ -11,9 +11,9 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# The new layouts count as layouts of another kind if the relief of every new scan is more than this factor
-# above the largest relief of the reference scans, or more than this factor below the smallest. The same rule
-# is applied to the steepness.
+# The new layouts count as layouts of another kind in two cases: every new relief exceeds the largest relief
+# of the reference scans by more than this factor, or every new relief is smaller than the smallest relief of
+# the reference scans by more than this factor. The same rule is applied to the steepness.
 _OTHER_KIND = 1.1
 # The error on training scans is smaller than on unseen scans. A difference up to this value, in units of the
 # spread of the error between reference scans, does not raise the rate of false alarms noticeably.
@@ -50,12 +50,12 @@ def _sentences(template: str, **values: object) -> list[str]:
 
 
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Return True if the errors on the reference scans cannot be compared with errors on unseen prints,
-    because the model was trained on the reference scans and their errors are too small.
+    """Return True if the model was trained on the reference scans and its errors on them are too small to
+    compare with errors on unseen prints.
 
     On scans that were used in the fit, a model has a smaller error than on unseen scans. The relative
-    difference is about the number of parameters divided by the number of independent pixels. All pixels of a
-    square with the side of one correlation length of the residual count as one independent pixel.
+    difference is about the number of parameters divided by the number of independent pixels. A square of
+    pixels whose side is the correlation length of the residual counts as one independent pixel.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))
