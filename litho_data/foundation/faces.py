@@ -44,7 +44,7 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
 
     Args:
         package: ``__name__`` of the package. No public name may equal the name of a module or subpackage of
-            the package. Importing this module would otherwise replace the public name.
+            the package, because importing such a module would replace the public name.
         file: the package's ``__init__`` file; every name that it imports with ``as`` is public.
 
     ``__version__`` is always among the public names. It is the version of the distribution, or ``"0"`` if the

@@ -46,9 +46,9 @@ def height_sigma(
         blur_px, model: results of the registration: the sigma of the blur, in layout pixels, and the kind of
             warp, as in ``warp_error``.
         levelled: whether a levelling recipe was applied. If so, the part ``levelling`` includes an estimate
-            of the surface that the recipe wrongly removed from the print. If not, this part is the mean
-            square of the quadratic surface by which the heights differ from the print. It is 0 if this
-            surface is not significant.
+            of the surface that the recipe wrongly removed from the print. If not, this part estimates the
+            quadratic surface by which the heights differ from the print. It is 0 if this surface is not
+            significant.
         fast_axis: the axis along which the tip moved fast.
         z_uncertainty: relative uncertainty of the z scale; 0 if the z scale was not calibrated.
 

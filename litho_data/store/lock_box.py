@@ -1,8 +1,8 @@
 """Choose the lock box of a dataset. The lock box contains scans that are set aside for the final test. They
 must not influence any choice of a model or an effect.
 
-The draw depends only on hashes of the ids and prints, and not on the random generator of a library. The same
-dataset therefore always has the same lock box.
+The draw uses hashes of the ids and prints, and no random generator of a library. The same dataset therefore
+always has the same lock box.
 """
 
 import hashlib

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Draw the height map of each reference scan, minus its mean. The maps of substrates and flat prints
+    """Draw the height map of each reference scan, minus its mean. The maps of substrates and of flat prints
     share one colour scale.
     """
     figure = new_figure(3.1 * len(references) + 0.6, 3.2)
