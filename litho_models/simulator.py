@@ -163,8 +163,8 @@ class Simulator(nn.Module, ABC):
         return crop_border(self(layout_um), border_px)
 
     def printer(self) -> Simulator:
-        """Return the model of the printer alone. If the model also describes the microscope, that part is
-        left out. Otherwise the model itself is returned.
+        """Return the model of the printer alone. If the model also describes the microscope, return a model
+        without the description of the microscope. Otherwise, return the model itself.
         """
         return self
 

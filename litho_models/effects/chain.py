@@ -28,9 +28,9 @@ class EffectChain(nn.Module):
         base: a simulator that maps a layout in µm to a height in µm. Both tensors have shape (b, 1, ny, nx).
         effects: parameter values of each effect, keyed by the name of the effect. A parameter that is not
             given is set to its value ``Parameter.off``.
-        frames: ``print`` for each effect that rotates with the print, and ``scan`` for each effect that
-            rotates with the scan, keyed by the name of the effect. By default, effects of stage
-            ``measurement`` rotate with the scan, and all others rotate with the print.
+        frames: frame of each effect, keyed by the name of the effect: ``print`` if the effect rotates with
+            the print, and ``scan`` if it rotates with the scan. By default, effects of stage ``measurement``
+            rotate with the scan, and all others rotate with the print.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
-"""Define an effect: a differentiable change of the layout or of the height. At the null values of its
-amplitudes, an effect changes nothing.
+"""Define an effect: a differentiable change of the layout or of the height. An effect changes nothing if each
+of its amplitudes has its null value.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class FieldContext:
             direction of ``torch.rot90``.
         backward: whether the scan consists of retrace lines.
         new_tip: whether the scan was made with a new, sharp tip instead of the usual one.
-        pixel_size: pixel size divided by the pixel size of the other scans. The time per pixel is the same in
-            all scans, so the lag length of the probe is proportional to the pixel size.
+        pixel_size: ratio of the pixel size of this scan to the pixel size of the other scans. The time per
+            pixel is the same in all scans, so the lag length of the probe is proportional to the pixel size.
         dose: dose relative to the recipe. This dose is already contained in ``layout_um``.
     """
 
@@ -169,8 +169,8 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise InputError. A per-scan effect has no formula, because its terms are fitted to each scan. This
-    function takes the place of the formula.
+    """Raise InputError. This function takes the place of the formula in a per-scan effect, whose terms are
+    fitted to each scan instead.
     """
     raise InputError(
         "an effect in a model",
@@ -197,19 +197,18 @@ class Effect:
         apply: the formula, a pure function ``apply(field, values, context)`` that returns the changed field.
             The field given and the field returned have shape (b, 1, ny, nx) and are in µm. For per-scan
             effects, ``apply`` is ``of_single_scans``.
-        trials: parameter sets that screening tries. By default, one amplitude is switched on at a time. Each
-            ``tried`` value of this amplitude is combined with every combination of the ``tried`` values of
-            the shapes.
+        trials: parameter sets that screening tries. By default, each set switches on one amplitude. The sets
+            contain all combinations of the ``tried`` values of this amplitude and of the shapes.
         source: where the formula comes from, such as a publication.
         separating: experiment that distinguishes this effect from similar effects.
-        needs: what a test of the effect requires: ``order`` if the writing order of the scans must be known,
-            and ``probe`` if the microscope must have a probe.
+        needs: requirements for a test of the effect. ``order``: the writing order of the scans must be known.
+            ``probe``: the microscope must have a probe.
         reverses: names of the parameters whose sign changes between trace and retrace lines.
         of_tip: whether the effect is absent from scans made with a new tip.
         of_films: True if this effect moves the edges of a film seen from above, and False if it changes
             heights.
-        knowledge: what is known about the effect. For a ``cause``, the physical cause is known; for a
-            ``law``, only a formula; for a ``description``, only the variable on which the effect depends.
+        knowledge: what is known about the effect: the physical cause (``cause``), only a formula (``law``),
+            or only the variable on which the effect depends (``description``).
     """
 
     name: str

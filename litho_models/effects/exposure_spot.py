@@ -33,8 +33,9 @@ _SLICED_REACH_UM = 0.8
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Make the spot elliptical: multiply the spectrum of the layout by T = exp(-2 π² fᵀ C f). The matrix C is
-    added to the matrix of second moments of the spot. The parameters are Cxx - Cyy and 2 Cxy.
+    """Make the spot elliptical: multiply the spectrum of the layout by T = exp(-2 π² fᵀ C f). This adds the
+    matrix C to the matrix of second moments of the spot. The parameters of the effect are Cxx - Cyy and
+    2 Cxy.
     """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
@@ -96,7 +97,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     """Cure slices of height t separately: the blurred layout G*M becomes
     (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
 
-    The difference between these two expressions (second minus first) is added to the height. The function
+    The effect adds this change, i.e. the second expression minus the first, to the height. The function
     ``step`` is a logistic function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice
     that is narrower than the spot is lost, and a gap that is narrower than the spot is filled.
     """

@@ -48,8 +48,8 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the height changes that a focus surface causes if it is tilted or curved over the write field: H +
-    1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
+    """Add the height changes caused by a focus surface that is tilted or curved over the write field:
+    H + 1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
     field.
     """
     y, x = context.centred_um()
@@ -90,9 +90,9 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     """Remove the part of the print that was written below the surface H_s of the substrate: max(H - z, H_s)
     where H > H_s.
 
-    The lost part has height z and shrinks as the remaining print does: z = z0 (1 - k (1 - u)). Here z0 is the
-    depth at which writing started, measured from the surface of the substrate, and u is the mean nominal
-    height nearby as a fraction of the full height.
+    The removed part has height z, and it shrinks like the rest of the print: z = z0 (1 - k (1 - u)). Here z0
+    is the depth at which writing started, measured from the surface of the substrate, and u is the mean
+    nominal height nearby as a fraction of the full height.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))

@@ -1,10 +1,10 @@
 """Laws: short formulas that describe how the height departs from the model. Each law gives this departure as
 a function of the height, the slopes, the surroundings, the position in the scan or the writing order.
 
-A law is an effect with one strength (a wave has two) and fitted shapes, such as a power, a length, a
-direction or a position. A law names no cause of the departure. Laws are screened, fitted, judged and applied
-by the same code as other effects. A table is an effect with many strengths. A table can describe any
-dependence on one covariate, such as the level or the position, but does not explain this dependence.
+A law is an effect with one strength (a law that adds a wave has two) and with fitted shapes, such as a power,
+a length, a direction or a position. A law names no cause of the departure. Laws are screened, fitted, judged
+and applied by the same code as other effects. A table is an effect with many strengths. A table can describe
+any dependence on one covariate, such as the level or the position, but does not explain this dependence.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ class Surface:
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return a function of the position in the scan at each pixel. ``word`` is the name of the function:
-        ``x``, ``y``, ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of the pixel from
-        the edge of the scan and ``length`` is a parameter of the law.
+        """Return the value, at each pixel, of a function of the position in the scan. ``word`` is the name of
+        the function: ``x``, ``y``, ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of
+        the pixel from the edge of the scan and ``length`` is a parameter of the law.
         """
         y, x = self.context.scan_position()
         if word == "rim":

@@ -132,7 +132,7 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Lower features narrower than w by a fraction φ of their height above the surroundings:
-    H - φ (H - open_w(H)).
+    H - φ (H - open_w(H)), where open_w is the morphological opening by a square of side w.
     """
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
@@ -144,7 +144,9 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
     separating="trenches of five widths, at two development times",
 )
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H). The tops are unchanged."""
+    """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H), where close_w is the
+    morphological closing by a square of side w. The tops are unchanged.
+    """
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
 
 

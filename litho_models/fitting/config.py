@@ -33,8 +33,8 @@ class TrainingConfig(Record):
 
     ``nuisance`` is the policy, i.e. the name of the set of terms that are fitted to each scan together with
     the model. These terms never become part of the model. The gain of a scan is not fitted in training,
-    because it would absorb part of the influence of the layout. The offsets of the training scans are
-    constrained to a mean of zero.
+    because a fitted gain would absorb part of the influence of the layout. The offsets of the training scans
+    are constrained to a mean of zero.
     """
 
     FORMER = frozenset({"free_gain"})

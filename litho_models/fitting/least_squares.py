@@ -34,8 +34,8 @@ _WEAKEST_INFLUENCE = 1e-8
 
 @dataclass(frozen=True)
 class Linearised:
-    """One scan with its prediction linearised at given parameters. All values are in µm, at n pixels of the
-    scan.
+    """One scan, and the linearisation of its predicted height at given parameters. All values are in µm, at n
+    pixels of the scan.
 
     Attributes:
         residual: measured minus predicted height; shape (n,).
@@ -78,7 +78,7 @@ class Rules:
         steps: largest number of steps.
         relative_gain: the fit ends after a step that reduces the loss by less than this fraction of the loss.
         tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
-            one.
+            attempt.
         lowest_damping: lower limit of the damping.
         kept_above: the derivatives are reused for the next step if the last step reduced the loss by at least
             this fraction of the predicted reduction. With None, the derivatives are computed anew after every
@@ -110,7 +110,8 @@ def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
     """Fit the parameters of a problem, beginning at the vector ``start``. The fitted parameters have the
-    dtype of ``start``. ``shown`` may wrap the range of the step numbers to show progress.
+    dtype of ``start``. The function ``shown`` receives the range of step numbers and can wrap it in a
+    progress display.
     """
     vector, linear = start, problem.linearise(start)
     if not len(start):
@@ -232,8 +233,8 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """Return the predicted reduction of the sum of squares by a step, according to the normal equations.
-    ``matrix`` has shape (p, p); ``right`` and ``step`` have shape (p,).
+    """Return by how much a step reduces the sum of squares according to the normal equations. ``matrix`` has
+    shape (p, p); ``right`` and ``step`` have shape (p,).
     """
     return float(2 * right @ step - step @ matrix @ step)
 

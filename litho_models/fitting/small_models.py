@@ -152,8 +152,8 @@ class _Sample:
 
 
 def _corner(scan: PrintedScan, usual: int) -> Window:
-    """Return the window of a scan that is fitted. The window lies in corner number ``usual`` of the four
-    corners or, if this corner has too few measured pixels, in the corner with the most measured pixels.
+    """Return the window in which a scan is fitted. The window lies in corner number ``usual`` of the scan. If
+    this corner has too few measured pixels, the window lies in the corner with the most measured pixels.
     """
     size = min(WINDOW_PX, *scan.shape)
     last_y, last_x = (length - size for length in scan.shape)

@@ -1,11 +1,11 @@
 """Train models with many parameters by stochastic gradient descent on random crops, in rounds.
 
-Before each round, the per-scan terms are estimated from predictions of whole scans and are removed from the
-measured heights, which are then the targets of the round. After each round, the validation scans are scored
-and a checkpoint is written. Random choices depend only on the seed and the step, so an interrupted and
-continued run gives the same result as an uninterrupted one. If there are several processes, they divide the
-crops of each step among themselves and add up their gradients. The computations between two rounds are not
-divided: every process repeats them.
+Before each round, the per-scan terms are estimated from predictions of whole scans. The measured heights
+minus these terms are the targets of the round. After each round, the validation scans are scored and a
+checkpoint is written. Random choices depend only on the seed and the step, so an interrupted and continued
+run gives the same result as an uninterrupted one. If there are several processes, they divide the crops of
+each step among themselves and add up their gradients. The computations between two rounds are not divided:
+every process repeats them.
 """
 
 import math
@@ -148,8 +148,8 @@ class _Targets:
 def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
-    """Take one optimiser step. Return the weighted absolute error, µm, and the mean weight as one tensor of
-    shape (2,). A GPU may still be computing this tensor when the function returns.
+    """Take one optimiser step. Return a tensor of shape (2,), which contains the weighted absolute error, µm,
+    and the mean weight. A GPU may still be computing this tensor when the function returns.
     """
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
@@ -173,8 +173,8 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of some windows, µm. Also return a tensor of shape (2,), which contains this loss and
-    the mean weight of the pixels for the training record.
+    """Return the loss of some windows, µm, and a tensor of shape (2,) for the training record. This tensor
+    contains the same loss, without a gradient, and the mean weight of the pixels.
 
     A random crop is predicted together with its surroundings or, if the model runs on tiles, as one tile. A
     quadrant is treated as a separate layout without surroundings.
@@ -218,8 +218,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
     """Return the number of pixels by which tiles may extend beyond a scan in training. This number is at
-    least the overlap of the tiles, as in prediction, and large enough for one tile to fit into the extended
-    scan.
+    least the overlap of the tiles, as in prediction. If a scan is smaller than a tile, the number is so large
+    that the extended scan contains a whole tile.
     """
     if model.tile is None or config.crops != "random":
         return 0

@@ -63,8 +63,8 @@ class ModelCard(RunFacts, Result):
     the value to the bound. ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on
     which the model was trained; ``litho-models check`` compares new prints with these values. For some
     effects, the measurements do not show whether the printer or the microscope causes the effect. Such an
-    effect can be attributed to one side when the model is frozen. ``attributed`` maps the name of the effect
-    to this side.
+    effect can be attributed to the printer or to the microscope when the model is frozen. ``attributed`` maps
+    the name of the effect to ``printer`` or ``microscope``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)

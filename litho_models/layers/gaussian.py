@@ -192,9 +192,9 @@ class _Blur(torch.autograd.Function):
 
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """Return the windows that the blocks of each sample need. A window is a block extended on both sides by
-    the radius of the kernel, so neighbouring windows overlap. The function returns one tensor per sample,
-    which is a view of shape (blocks, length of the other axis, window).
+    """Divide each sample into blocks along the axis, and return the window of each block. A window is a block
+    extended on both sides by the radius of the kernel, so neighbouring windows overlap. The function returns
+    one tensor per sample, which is a view of shape (blocks, length of the other axis, window).
 
     The samples are kept apart, because a single matrix product over several samples would copy the windows.
     """

@@ -65,9 +65,9 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
 
 
 def registered_sources(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return hashes of the registered code on which a model depends: the code of the model's class, and the
-    code of the parts that ``settings`` names. The dict is empty if the model and all of its parts belong to
-    this package.
+    """Return hashes of the code outside this package on which a model depends: the code of a registered model
+    class, and the code of those registered parts that ``settings`` names. The dict is empty if the model and
+    all of its parts belong to this package.
     """
     modular = issubclass(model_class(name), Printer)
     named = settings["parts"] if modular else [settings.get("illumination")]
@@ -124,9 +124,9 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
     geometry and its hyper-parameters.
 
     Raises:
-        InputError: the model or a field is unknown; a parameter to fix is unknown or belongs to a network
-            inside the model; a value is not allowed; or a registered model does not predict a map of finite
-            heights.
+        InputError: the model or a field is unknown; ``fixed`` names an unknown parameter or a parameter of a
+            network inside the model; a value is not allowed; or a registered model does not predict a map of
+            finite heights.
     """
     kind = model_class(name)
     for field in fields:
@@ -148,8 +148,8 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
 
 
 def _require_heights(model: Simulator) -> None:
-    """Predict the print of a layout that rises evenly over all levels. Raise an InputError that names the
-    model if the prediction fails or is not a finite height for each pixel.
+    """Predict the print of a ramp that rises from level 0 to the highest level. Raise an InputError that
+    names the model if the prediction fails or is not a finite height for each pixel.
     """
     side = model.tile.size_px if model.tile else _TRIAL_PX
     ramp = torch.linspace(0, model.config.full_height_um, side * side).reshape(1, 1, side, side)

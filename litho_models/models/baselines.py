@@ -1,5 +1,6 @@
-"""Baselines: simple models that every other model should surpass. The baselines range from the unchanged
-layout to models that are linear in features. In the formulas, M is the layout and H the printed height.
+"""Baselines: simple models that every other model should surpass. The simplest baseline is the unchanged
+layout. The largest baseline is a weighted sum of features of the layout. In the formulas, M is the layout and
+H the printed height.
 """
 
 import torch
@@ -146,9 +147,9 @@ class LinearConfig(SimulatorConfig):
 
 
 class Linear(Simulator):
-    """A weighted sum of features: H = w · φ(M). The features φ are Gaussian blurs of the layout, powers and
-    squared slopes of one further blur B, and the constant 1. The powers are (B - r)², (B - r)³ and (B - r)⁴,
-    where r is ``power_reference_um``.
+    """A weighted sum of features: H = w · φ(M). The features φ are the constant 1, Gaussian blurs of the
+    layout, and powers and squared slopes of one additional blur B. The powers are (B - r)², (B - r)³ and
+    (B - r)⁴, where r is ``power_reference_um``.
 
     The slopes along y and along x have separate weights, because the two axes of a print may differ.
     """

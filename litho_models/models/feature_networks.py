@@ -28,7 +28,9 @@ Widths = tuple[float, ...]
 
 
 class FeatureNetworkConfig(BaseModel):
-    """Settings of a feature network: the lengths of its features, µm, and the numbers of its hidden units."""
+    """Settings of a feature network: the widths and displacements of its features, µm, and the numbers of its
+    hidden units.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     LENGTHS: ClassVar[tuple[str, ...]] = ("blurs_um", "slope_blurs_um", "shifts_um", "steep_um")
@@ -127,8 +129,8 @@ class FeatureNetwork(OfField):
         """
 
     def _steepness(self, field: Tensor) -> list[Tensor]:
-        """Return the magnitude of the slope and the squared slope, each averaged over several widths around
-        every pixel.
+        """Return local means of the magnitude of the slope and of the squared slope. The means have Gaussian
+        weights, and there is one mean for each width of the weights.
         """
         sigma, widths = self.config.slope_blurs_um[0], self.config.steep_um
         margin = self._radius(*widths)
@@ -169,7 +171,7 @@ class Surroundings(FeatureNetwork):
 
 class ScanAxis(FeatureNetwork):
     """A network whose inputs are features of the printed height along x: slopes, steps, and the mean
-    steepness. The microscope scans its lines in this direction.
+    steepness. The microscope scans its lines along x.
 
     All features are 0 where the print does not change along x, so the network adds nothing there.
     """

@@ -140,15 +140,16 @@ class Features(OfField, Simulator):
         return self.weights @ self.completed(torch.stack(features))
 
     def completed(self, features: Tensor) -> Tensor:
-        """Append the further features that a subclass computes from φ(M). ``features`` contains φ(M) at n
-        pixels. The result has one row for each weight and therefore shape (weights, n).
+        """Return the features φ(M), followed by the features that a subclass computes from them. ``features``
+        contains φ(M) at n pixels. The result has one row for each weight and therefore shape (weights, n).
         """
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Return the features φ(M) of the interior in two lists. The first list contains the simple features,
-        such as blurs, slopes and displaced copies. The second list contains products of these features, and
-        the constant 1. Each feature is a map of shape (batch, 1, ny, nx).
+        such as blurs, slopes and displaced copies. The second list contains products and cubes of these
+        features, magnitudes of gradients, and the constant 1. Each feature is a map of shape (batch, 1, ny,
+        nx).
         """
         config = self.config
         layout = layout_um / config.full_height_um
@@ -164,8 +165,9 @@ class Features(OfField, Simulator):
         return simple, [*products, torch.ones_like(blurs[0])]
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """Evaluate every weighted feature at n pixels. ``at`` contains the flat indices of these pixels in
-        the interior of a layout of shape (1, 1, ny, nx). The result has shape (weights, n).
+        """Evaluate all features, including those that ``completed`` adds, at n pixels. ``at`` contains the
+        flat indices of these pixels in the interior of a layout of shape (1, 1, ny, nx). The result has shape
+        (weights, n).
         """
         simple, products = self.features(layout_um)
         return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
@@ -205,8 +207,9 @@ class Features(OfField, Simulator):
         return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
 
     def _steepness(self, layout: Tensor) -> list[Tensor]:
-        """Return the magnitude and the square of the slope along y and along x, each averaged over several
-        widths around every pixel. A slope here is the height change over the distance σ.
+        """Return local means of the magnitude and of the square of the slope along y and along x. The means
+        have Gaussian weights, and there is one mean for each width of the weights. A slope here is the height
+        change over the distance σ.
         """
         widths, found = self.config.steep_widths_um, []
         margin = self._radius(*widths)
@@ -230,12 +233,13 @@ class RandomFeaturesConfig(FeaturesConfig):
 
 
 class RandomFeatures(Features):
-    """The model ``Features`` with additional features tanh(V z + c), where z are the standardised simple
-    features. V and c are random and not fitted.
+    """The model ``Features`` with additional features tanh(V z + c). The vector z contains the standardised
+    simple features, which are the first list that ``features`` returns. V and c are random and are not
+    fitted.
 
     The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). Each
-    random feature depends on several simple features (``inputs``), while a product depends on only two. The
-    weights are still found in closed form.
+    random feature depends on ``inputs`` simple features, whereas each product in ``Features`` depends on only
+    two. The weights are still found in closed form.
     """
 
     name = "random-features"

@@ -79,8 +79,8 @@ class Fno(Simulator):
 
     P maps each pixel to ``width`` channels. With ``coordinates``, P also receives y and x. Q maps the
     channels to a height through one hidden layer. With ``starts_as_layout``, this height is added to M and is
-    zero before training. If the configuration has a tile size, ``interior`` returns the height of one tile,
-    which is treated as periodic. The heights of the tiles are then blended to the height of the whole layout.
+    zero before training. If the configuration has a tile size, ``interior`` treats one tile as periodic and
+    returns its height. The heights of all tiles are then blended to the height of the whole layout.
     """
 
     name = "fno"
@@ -166,8 +166,8 @@ class SpectralConvolution(nn.Module):
     frequencies are set to zero.
 
     The weights are stored as real numbers, so that they can be saved and converted like any other parameter.
-    Their shape is (2, channels in, channels out, modes along y, modes along x, 2). The first axis is the sign
-    of k_y, and the last axis is the real and imaginary part.
+    Their shape is (2, channels in, channels out, modes along y, modes along x, 2). The first axis
+    distinguishes the two signs of k_y, and the last axis distinguishes the real and the imaginary part.
     """
 
     def __init__(self, channels: int, modes: tuple[int, int]):

@@ -64,8 +64,8 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
 
 
 def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tensor:
-    """Return the intensity of the image of a mask that is not periodic, without the outermost ``reach_px``
-    pixels.
+    """Return the intensity of the image of a mask that is not periodic. The outermost ``reach_px`` pixels are
+    cropped from the image.
     """
     # Fourier transforms spread rounding errors over the whole field. In double precision, the rounding errors
     # are so small that computing the image in tiles gives the same result as computing it at once.

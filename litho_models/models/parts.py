@@ -2,8 +2,8 @@
 turns one field, such as a dose, into the next field; the parameters of this function; and a reference for its
 formula.
 
-Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. A part
-may crop the field that it returns by its receptive radius on each side.
+Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. The
+field that a part returns may be cropped on each side by the receptive radius of the part.
 """
 
 import math
@@ -129,8 +129,8 @@ def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
 
 def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
     """Return the depth that is developed after a dose E, as a share of the full depth: 1 + γ log₁₀(E / E₀),
-    where γ is the contrast and E₀ the clearing dose. The share is limited to 0 ... 1. At both limits, the
-    curve has rounded instead of sharp corners, so that it stays differentiable.
+    where γ is the contrast and E₀ the clearing dose. The share is limited to 0 ... 1. The corners of the
+    curve at both limits are rounded, so that the curve is differentiable.
     """
     depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
     return (functional.softplus(_CORNERS * depth) - functional.softplus(_CORNERS * (depth - 1))) / _CORNERS
@@ -140,9 +140,10 @@ def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pit
     """Return the share of each pixel's area that an etched film covers. The film remains where the resist
     exceeds the threshold. The result is cropped by one pixel on each side.
 
-    The edge of the film lies where the resist crosses the threshold, moved outward by the bias. A pixel that
-    the edge crosses is partly covered. The coverage is a sigmoid of the distance from the edge, (resist -
-    threshold) / |∇ resist| + bias. The sigmoid is about one pixel wide.
+    The edge of the film is the line on which the resist crosses the threshold, moved outward by the bias. A
+    pixel that the edge crosses is partly covered. The distance of a pixel from the edge is (resist -
+    threshold) / |∇ resist| + bias, and the coverage is a sigmoid of this distance. The sigmoid is about one
+    pixel wide.
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2

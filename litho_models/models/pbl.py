@@ -160,8 +160,8 @@ class Pbl(Simulator):
     The variant ``default`` adds two feature networks to this chain of steps. ``surroundings`` describes how
     the layout within some micrometres of a pixel influences its height. This influence is the same along x
     and y. ``scan_axis`` describes how the height along x influences the measured height. This second
-    influence may come from the microscope. ``scan_axis`` takes part in the fit so that the other networks do
-    not learn this influence, but ``printer()`` returns the model without ``scan_axis``.
+    influence may come from the microscope. The fit includes ``scan_axis``, so that the other networks do not
+    learn this influence. ``printer()`` returns the model without ``scan_axis``.
     """
 
     name = "pbl"
@@ -185,8 +185,8 @@ class Pbl(Simulator):
 
     @property
     def feature_networks(self) -> list[FeatureNetwork]:
-        """Return the feature networks of the model, in the order of the input fields that ``feature_fields``
-        returns.
+        """Return the feature networks of the model. ``feature_fields`` returns their input fields in the same
+        order.
         """
         return [network for network in (self.surroundings, self.scan_axis) if network is not None]
 

@@ -99,9 +99,9 @@ class Physics(Simulator):
     the concave part of the tanh.
 
     The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
-    ``default`` scales the diffused dose by a fixed range. ``paper`` scales it by its range over the layout,
-    and ``authors`` by its maximum over the layout. In ``paper`` and ``authors``, the height of a pixel
-    therefore changes if the layout is cropped differently.
+    ``default`` scales the diffused dose by a fixed range. ``paper`` uses the range of the dose over the
+    layout, and ``authors`` uses the maximum of the dose over the layout. In ``paper`` and ``authors``, the
+    height of a pixel therefore changes if the layout is cropped differently.
     """
 
     name = "physics"

@@ -19,8 +19,8 @@ class PrinterConfig(SimulatorConfig):
     parameters. A fitted parameter starts at its value; any other parameter stays at its value. The name of a
     parameter has the form ``part.parameter``.
 
-    Each parameter can also be set like a field of the configuration, under this name, such as
-    ``spot.sigma_um``.
+    A parameter can also be set under this name, such as ``spot.sigma_um``, as if it were a field of the
+    configuration.
     """
 
     parts: tuple[str, ...] = Field(

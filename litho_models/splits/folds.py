@@ -159,7 +159,7 @@ def grouped_folds(ids: Sequence[str], fields: Sequence[str], k: int = 5, seed: i
 
 def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:
     """Return one fold per print, in the order of the names of the prints. Each fold holds out all scans of
-    its print. It is given as the list of the ids of these scans.
+    its print, and is given as the list of the ids of these scans.
 
     Raises:
         InputError: there are fewer than two prints, or an id is repeated.
