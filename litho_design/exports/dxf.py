@@ -16,8 +16,9 @@ _BAND_PX = 128
 
 
 def write_dxf(path: Path, levels: LevelRows, pitch_um: float, greys: Sequence[int]) -> int:
-    """Cover the pixels of each level whose grey value is not 0 with disjoint rectangles, and write the
-    rectangles to a file. Coordinates are in µm, and y points upwards. Return the number of rectangles.
+    """For each level whose grey value is not 0, cover the pixels of this level with disjoint rectangles.
+    Write the rectangles to a file. Coordinates are in µm, and y points upwards. Return the number of
+    rectangles.
     """
     count = 0
     with open(path, "w", encoding="ascii") as stream:

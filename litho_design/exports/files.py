@@ -82,7 +82,7 @@ def export(
     """Write a layout as a file for the printer, and the sidecar ``<file>.json``, which describes the file.
 
     Before the export finishes, the file is read back and compared with the layout. ``tiff`` and ``gds`` are
-    written and read one band of rows at a time, so memory does not grow with the height of an element.
+    written and read one band of rows at a time, so memory does not grow with the number of rows.
 
     Args:
         design: a design (its folder, or the result of ``load_design``), an ``Element``, an array of shape

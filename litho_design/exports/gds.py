@@ -1,5 +1,5 @@
 """Write layouts as GDSII, one band of rows at a time. The file has one layer per level. Blocks of pixels with
-equal levels share one GDS cell.
+the same content share one GDS cell.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ def write_gds(
     Layer k contains the pixels with level >= k (``cumulative``; k starts at 1) or the pixels with level == k
     (``exclusive``; k starts at 0). A run of such pixels along a row is merged with equal runs in the rows
     below, so every shape is a rectangle. The GDS cell LAYOUT references one GDS cell for each part. The GDS
-    cell of a part references one for every 128 rows, and each of these references the GDS cells of blocks 128
-    pixels wide. Equal blocks share a GDS cell. Only the shapes of one block are in memory at a time.
+    cell of a part references one GDS cell for each band of 128 rows. The GDS cell of a band references the
+    GDS cells of its blocks, which are 128 pixels wide. Equal blocks share a GDS cell. Only the shapes of one
+    block are in memory at a time.
 
     Args:
         parts: mapping from the name of each part to its box (first row, end row, first column, end column),

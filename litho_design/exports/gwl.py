@@ -18,14 +18,14 @@ _PIEZO_UM = 300.0
 
 
 def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float, job: PrintJob) -> int:
-    """Write a GWL file. Its write fields follow one another, each from the lowest slice of the pedestal
-    (base) upwards. Return the number of lines that the laser writes.
+    """Write a GWL file. The printer writes one field after another, each from the lowest slice of the
+    pedestal (base) upwards. Return the number of lines that the laser writes.
 
-    The lines of a slice lie at half of its thickness. Each line lies in the middle of a strip whose width is
-    the hatching distance. Along x, a line extends over a run of adjacent pixels whose levels reach the slice,
-    from the outer edge of the first pixel to the outer edge of the last one. The origin of x and y is the
-    lower left corner of the element, and y points upwards. In galvo mode, the stage moves to the middle of
-    each field, and coordinates in the field are relative to this point.
+    In height, the lines of a slice lie in the middle of the slice. Each line lies in the middle of a strip
+    whose width is the hatching distance. Along x, a line extends over a run of adjacent pixels whose levels
+    reach the slice, from the outer edge of the first pixel to the outer edge of the last one. The origin of x
+    and y is the lower left corner of the element, and y points upwards. In galvo mode, the stage moves to the
+    middle of each field, and coordinates in the field are relative to this point.
 
     Raises:
         InputError: the level height or the pedestal is not a multiple of the slicing distance, or the pitch

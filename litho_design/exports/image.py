@@ -67,8 +67,8 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
 
 
 def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:
-    """Write a 16-bit greyscale PNG; or an 8-bit BMP, together with a CSV that states the height of each grey
-    value.
+    """Write either a 16-bit greyscale PNG or an 8-bit BMP. With the BMP, also write a CSV that states the
+    height of each grey value.
     """
     import cv2
 

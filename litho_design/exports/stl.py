@@ -68,8 +68,8 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
     Returns:
         Float32 array of shape (m, 3, 3) with axes triangle, corner and coordinate (x, y, z). The unit of x
-        and y is one cell, and that of z is one level; the underside lies at -1. Seen from outside, the
-        corners of a triangle run counter-clockwise.
+        and y is one cell, and the unit of z is one level. The underside lies at z = -1. Seen from outside,
+        the corners of a triangle run counter-clockwise.
     """
     cells = np.pad(np.asarray(levels, np.int16), 1, constant_values=_BELOW)
     around = np.stack([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=-1)

@@ -17,8 +17,8 @@ class MeasuredSource:
     """A height map of the printed part. If the file does not state the unit and the size, pass ``unit`` and
     ``size_um`` (the side of a square map, or the lengths along y and x).
 
-    If an element looks the same at several positions or in several orientations, such as a lens cap or a
-    blaze, its scan cannot be registered. In this case, align the scan with the element and set ``aligned``.
+    Some elements, such as a lens cap or a blaze, look the same at several positions or in several
+    orientations, so their scans cannot be registered. Align such a scan with the element and set ``aligned``.
     """
 
     path: Path = setting(..., "AFM height map of the printed part", option="--scan")

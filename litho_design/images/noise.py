@@ -33,8 +33,8 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
     is the standard deviation of the noise in the dark, in counts. The second is the standard deviation of the
     noise that is proportional to the light, as a share of the light.
 
-    The second kind includes speckle. With the two standard deviations ``dark`` and ``share``, the variance at
-    the highest frequencies is fitted as dark^2 + (share * light)^2.
+    The second kind includes speckle. The variance at the highest spatial frequencies is fitted as dark^2 +
+    (share * light)^2, where ``dark`` and ``share`` are the two returned values.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -63,10 +63,11 @@ def estimated(
     """Correct the scores of a measurement for its errors. Return two dicts, keyed by the name of the score:
     the corrected scores, and their standard deviations.
 
-    Errors that remain in a measurement bias its scores. If the same error is added once more, the mean change
-    of a score equals this bias, so it is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993,
-    chapter 10). Other errors are hidden: a fit, such as levelling, makes the print look more like the
-    expected print than it is. The mean change of a score over the variants in ``hidden`` is therefore added.
+    Errors that remain in a measurement bias its scores. The same kinds of errors are therefore added once
+    more. This changes a score, on average, by the same bias, which is then subtracted (bias correction by
+    bootstrap, Efron and Tibshirani 1993, chapter 10). Other errors are hidden by a fit, such as levelling:
+    the fit makes the print look more like the expected print than it is. The mean change of a score over the
+    variants in ``hidden`` is therefore added.
 
     The variants come in pairs. The two variants of a pair contain the same error with opposite signs. In
     ``left`` and ``hidden``, each pair changes one independent parameter by its standard deviation. If the
@@ -101,6 +102,8 @@ def _changes(score: Callable[[T], Record], measured: Record, variants: Iterable[
 
 
 def _parts(changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split the changes of a score in pairs of variants into their even and their odd parts."""
+    """Return the even and the odd part of the change of a score for each pair of variants. In ``changes``,
+    the two variants of a pair follow one another.
+    """
     plus, minus = changes.reshape(-1, 2).T
     return (plus + minus) / 2, (plus - minus) / 2

@@ -71,8 +71,8 @@ class CameraRecord(Record):
     the standard deviation of the fitted position along one axis, and ``scale_sd`` is the relative standard
     deviation of the fitted scale. ``vignetting_sd`` is the standard deviation of the relative loss of light
     in the corners of the photograph. ``blur_um`` is the standard deviation (radius) of the fitted blur that
-    is added to the expected image. The counts are fitted as proportional to light^gamma, and ``gamma`` is the
-    fitted exponent.
+    is added to the expected image. ``gamma`` is a fitted exponent: in the fit, the counts are proportional to
+    light^gamma.
     """
 
     name: str
@@ -188,7 +188,8 @@ class Photograph:
 
     def with_other_faults(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one fault of the camera differs by plus and minus its standard
-        deviation. The faults are vignetting and, with half of its variance, a tilt too small to be fitted.
+        deviation. The faults are vignetting and a tilt too small to be fitted. Half of the variance of the
+        tilt is used here (see ``other_tilts``).
         """
         yield from (self._warped(self.counts, warp) for pair in self.other_tilts for warp in pair)
         for sign in (1, -1) if self.record.vignetting_sd else ():
@@ -196,8 +197,8 @@ class Photograph:
 
     def with_other_fits(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one fitted property of the camera differs by plus and minus its
-        standard deviation. The properties are its independent movements, its dark level and, with half of its
-        variance, a tilt too small to be fitted.
+        standard deviation. The properties are the independent movements of the camera, the dark level, and a
+        tilt too small to be fitted. Half of the variance of the tilt is used here (see ``other_tilts``).
         """
         pairs = self.other_warps + self.other_tilts
         yield from (self._warped(self.counts, warp) for pair in pairs for warp in pair)
@@ -243,10 +244,10 @@ def photographed_image(
 
     The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
     neighbours. Then a model of the camera is fitted by least squares, so that the photograph matches the
-    expected image. Its parameters are position, rotation, gain and background, and a tilt if needed. The
-    scale is fitted only if the pitch has an uncertainty. Otherwise, an image that is too large because of the
-    print would be mistaken for a camera with a different scale. All eight orientations are tried. A
-    photograph that fits another orientation better than ``orientation`` is rejected.
+    expected image. The parameters of the camera are position, rotation, gain and background, and a tilt if
+    needed. The scale is fitted only if the pitch has an uncertainty, because a fitted scale would conceal
+    that a print makes its image too large. All eight orientations are tried. A photograph that fits another
+    orientation better than ``orientation`` is rejected.
 
     Args:
         wanted: expected image in any unit, shape (m, m).
@@ -260,7 +261,8 @@ def photographed_image(
     Raises:
         InputError: the file is not an image, the pitch is not positive or too coarse for the finest detail of
             the image, or the orientation is unknown. The error is also raised if the photograph is
-            overexposed, not linear, unlike the expected image, mirrored or rotated.
+            overexposed or not linear, if it does not resemble the expected image, or if it is mirrored or
+            rotated.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
@@ -348,9 +350,9 @@ def photographed_image(
 
 
 def _saturated(raw: np.ndarray) -> float:
-    """Return the share of saturated pixels. A pixel is saturated if it has the highest count of the
-    photograph, and if this count is the end of the range of 8, 10, 12, 14 or 16 bits or occurs in unusually
-    many pixels.
+    """Return the share of saturated pixels. The pixels with the highest count of the photograph are saturated
+    if this count is the end of the range of 8, 10, 12, 14 or 16 bits, or if unusually many pixels have this
+    count.
     """
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
@@ -587,8 +589,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
     """Return the covariance of a least-squares fit in which the residuals of neighbouring pixels are
     correlated. The covariance is computed from the scatter between tiles of the window, and each tile counts
-    as one observation (White 1980). If the print differs from the expected print, the apparent displacement
-    varies from tile to tile.
+    as one observation (White 1980). The covariance thereby includes the effect of a print that differs from
+    the expected print and is apparently displaced by a different amount in each tile.
     """
     tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
     number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))

@@ -38,7 +38,7 @@ class TargetRecord(Record):
 
     @classmethod
     def of_array(cls, name: str, pixels: np.ndarray, unit: str) -> TargetRecord:
-        """Make the record of a drawing, or of an array that is used unchanged, shape (ny, nx)."""
+        """Make the record of a drawing or of an array, whose pixels, shape (ny, nx), are used unchanged."""
         return cls(name=name, sha256=array_sha256(pixels, unit, ("y", "x")))
 
 
@@ -67,10 +67,10 @@ def load_target(source: str | Path | np.ndarray | Tensor | Target, size_px: int)
     an image, or an array. A ``Target`` is returned unchanged.
 
     Args:
-        source: the drawing text, ring, chart, spots or letters; an image file; or an array or tensor of shape
-            (ny, nx) with values in [0, 1]. An image is converted to grey values and divided by its brightest
-            value; the values of an array are not rescaled. Images and arrays are placed on a black square and
-            resampled to ``size_px``.
+        source: name of a drawing (``text``, ``ring``, ``chart``, ``spots`` or ``letters``); an image file; or
+            an array or tensor of shape (ny, nx) with values in [0, 1]. An image is converted to grey values
+            and divided by its brightest value; the values of an array are not rescaled. Images and arrays are
+            placed on a black square and resampled to ``size_px``.
 
     Raises:
         InputError: the source is not a drawing, a readable image or an array of numbers, or the image has no

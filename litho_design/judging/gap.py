@@ -38,7 +38,7 @@ class GapEntry(Record):
 
 class GapSummary(Record):
     """The mean of one score over the designs of one arm (one design per seed), with a 95 % confidence
-    interval. One judge predicts the prints.
+    interval. The same judge predicts all prints.
     """
 
     arm: str
@@ -53,7 +53,7 @@ class GapSummary(Record):
 
 class PairedDifference(Record):
     """The difference in one score between designs of two arms with the same seed, averaged over the seeds.
-    One judge predicts the prints.
+    The same judge predicts all prints.
     """
 
     judge: str

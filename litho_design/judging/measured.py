@@ -53,11 +53,11 @@ class MeasuredRecord(Record):
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
     ``tilt_um_per_um`` (x, y) is the removed tilt, and ``bow_um`` is the height range of the removed bow over
     the element. ``noise_um`` is the standard deviation of the noise, from spatial frequencies at which prints
-    have no structure. The print itself may also have tilt and bow, which levelling removes as well;
-    ``removed_sd_um`` is the standard deviation of each term that may be lost in this way. ``position_sd_um``
-    is the standard deviation of the position of a corner along one axis, and ``scale_sd`` is the relative
-    standard deviation of the height scale. ``defect_share`` is the share of the element that shows dust or
-    scars instead of the print.
+    have no structure. Levelling also removes tilt and bow of the print itself. ``removed_sd_um`` is the
+    expected standard deviation of each term of the print that is lost in this way. ``position_sd_um`` is the
+    standard deviation of the position of a corner along one axis, and ``scale_sd`` is the relative standard
+    deviation of the height scale. ``defect_share`` is the share of the element that shows dust or scars
+    instead of the print.
     """
 
     name: str
@@ -372,8 +372,8 @@ def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
     """Displace a print of shape (ny, nx) by an affine map. ``corner_px``, shape (2, 3), contains for each
     axis a shift and two linear terms. If these numbers are random with the standard deviation s, the corners
     move by s px (rms) along each axis. The three terms are weighted like the errors of an affine map that is
-    fitted to points spread evenly over a square. Such a fit displaces
-    the edges of the square by a shift and by two linear terms, whose variances are in the ratio 1 : 3 : 3.
+    fitted to points spread evenly over a square. The errors of such a fit displace the edges of the square by
+    a shift and by two linear terms, whose variances are in the ratio 1 : 3 : 3.
     """
     from scipy.ndimage import affine_transform
 
@@ -386,8 +386,9 @@ def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
 
 
 def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
-    """Return all products of a Legendre polynomial in y and one in x whose total order is in ``orders``. Each
-    product has an rms of 1. The result has shape (ny, nx, number of products).
+    """Return all products of a Legendre polynomial in y and a Legendre polynomial in x whose two orders add
+    up to a number in ``orders``. Each product has an rms of 1. The result has shape (ny, nx, number of
+    products).
     """
     y, x = (np.linspace(-1, 1, size) for size in shape)
     pairs = [(i, order - i) for order in orders for i in range(order + 1)]

@@ -155,10 +155,10 @@ def score_lens_photo(
 ) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
-    ``photographed_image`` cleans the photograph and registers it to the expected image, i.e. the image of
-    this object on sensor pixels that the expected print would form. Then the photograph is deconvolved by the
-    Richardson-Lucy algorithm with the number of iterations of the design. The image of the object must be as
-    large as in the design; otherwise, the PSFs do not apply.
+    ``photographed_image`` cleans the photograph and registers it to the expected image. The expected image is
+    the image that the expected print would form of this object, sampled on sensor pixels. Then the photograph
+    is deconvolved by the Richardson-Lucy algorithm with the number of iterations of the design. The image of
+    the object must be as large as in the design; otherwise, the PSFs do not apply.
 
     Args:
         loaded: the design of a lens.

@@ -53,7 +53,9 @@ class JudgedScore(Record):
     uncertainty: dict[str, float] | None = None
 
     def remarks(self) -> list[str]:
-        """Return remarks on the processing of a measurement, one phrase each. A model has none."""
+        """Return remarks on the processing of a measurement, one phrase each. If the judge is a model, there
+        are none.
+        """
         return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 

@@ -140,7 +140,7 @@ def lens_settings(
 
     Args:
         task: ``direct`` for a lens that focuses light, or ``computational`` for a lens that images objects
-            and whose images are deconvolved. A ``task`` among the changes overrides it.
+            and whose images are deconvolved. A ``task`` among the changes overrides this argument.
         variant, changes: as for ``hologram_settings``.
 
     Raises:

@@ -110,8 +110,9 @@ class LensTask(Task):
         return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        """Return a bench that computes along a radius, if the settings request this search and no printer
-        depends on the position. Otherwise, return a bench of the whole plane.
+        """If the settings request a search along a radius and the prints do not depend on the position in the
+        write field, return a bench that computes along a radius. Otherwise, return a bench of the whole
+        plane.
         """
         if not self.radial:
             return self.make_bench(optics)
@@ -205,9 +206,9 @@ class ComputationalLensTask(LensTask):
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the difference between the objects and their reconstructions from the sensor images by
-        Richardson-Lucy deconvolution, as a mean error. Also return a dict with the centre-to-background ratio
-        and the share of the power in the PSF window.
+        """Reconstruct the objects from the sensor images by Richardson-Lucy deconvolution, and return the
+        mean error of the reconstructions. Also return a dict with the centre-to-background ratio and the
+        share of the power in the PSF window.
         """
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
@@ -265,8 +266,8 @@ def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
 
 
 def check_lens(settings: LensSettings, *, radial: bool) -> None:
-    """Check that a lens with these settings can be designed. If ``radial`` is True, it must be possible to
-    design it along a radius.
+    """Check that a lens with these settings can be designed. If ``radial`` is True, also check that the
+    search can run along a radius.
 
     Raises:
         InputError: a search along a radius cannot represent the layout, the aperture or the light; the

@@ -27,14 +27,14 @@ class ASMPropagator(KernelPropagator):
     imaginary, so these waves decay. Because H is sampled, the propagated field is periodic. The period is
     long enough that the steepest rays do not wrap around, but it never exceeds 4096 pixels. Frequencies whose
     rays would still wrap around are removed (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662).
-    A longer period makes only the construction slower, because the kernel is stored only at the separations
-    that occur between the two grids. If the distance is negative, waves are propagated backwards and
-    evanescent waves are dropped.
+    A longer period slows down the construction of the propagator but not the propagation, because the kernel
+    is stored only at the separations that occur between the two grids. If the distance is negative, waves are
+    propagated backwards and evanescent waves are dropped.
 
-    Pixels larger than half a wavelength represent rays only up to a certain angle. For waves that contain
-    only such rays, the result is exact. Smaller pixels also represent rays close to grazing. With such
-    pixels, 1 % of the wave behind a rough element is missing or wrapped around, so ``RSPropagator`` is the
-    better choice.
+    If the pixels are larger than half a wavelength, they represent rays only up to a certain angle, and the
+    result for waves of such rays is exact. If the pixels are smaller, they also represent rays close to
+    grazing. In this case, 1 % of the wave behind a rough element is missing or wrapped around, so
+    ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of the two planes. Their pitches must be equal, but their shapes and origins may
@@ -72,9 +72,9 @@ class ASMPropagator(KernelPropagator):
 class SpectrumAxis:
     """One axis of the spectrum of a wave between two grids.
 
-    ``frequency`` contains the frequencies in cycles/µm, and ``inside`` is True at the frequencies that are
-    kept. ``kept`` contains the indices of the kernel samples that are stored, and ``start_um`` is the shift
-    from the source grid to the target grid.
+    ``frequency`` contains the frequencies in cycles/µm. ``inside`` is False at the frequencies that are
+    removed because their rays would wrap around. ``kept`` contains the indices of the kernel samples that are
+    stored, and ``start_um`` is the shift from the source grid to the target grid.
     """
 
     frequency: Tensor

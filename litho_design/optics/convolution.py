@@ -1,4 +1,6 @@
-"""Convolve by FFT. Neither the convolution nor its gradient transforms rows that are cropped afterwards."""
+"""Convolve by FFT. Rows that are cropped afterwards are not transformed, neither in the convolution nor in
+its gradient.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,8 @@ def wrapped_order(here: int, there: int) -> Tensor:
     """Return all separations, in pixels, between ``here`` source pixels and ``there`` target pixels along one
     axis. They are in the order that an FFT needs.
 
-    Negative separations come last. Unused entries repeat a used separation.
+    Negative separations come last. If the FFT has more entries than there are separations, the surplus
+    entries repeat the lowest separation.
     """
     length = fast_length(here + there - 1)
     index = torch.arange(length)
@@ -93,7 +96,7 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 class _Convolution(torch.autograd.Function):
     """A convolution and its gradient. The gradient is computed by the adjoint, which is a convolution with
     the conjugate transfer function. The gradient is implemented explicitly, because autograd would keep
-    padded copies of the field. It would also transform rows that are cropped afterwards.
+    padded copies of the field and would also transform rows that are cropped afterwards.
     """
 
     @staticmethod

@@ -1,4 +1,6 @@
-"""Choose a propagator: the one that the settings request, or one that is valid at the given distance."""
+"""Choose the propagator that the settings request or, for ``auto``, a propagator that is valid at the given
+distance.
+"""
 
 from __future__ import annotations
 

@@ -69,9 +69,9 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Return two integers: the number of fine pixels per pixel of the first grid, and per pixel of the second
-    grid, for the coarsest fine grid that suits both. ``pitches`` is the second pitch divided by the first.
-    Return None if one of the integers would exceed 16.
+    """Find the largest pitch of which the pitches of two grids are integer multiples. Return these two
+    integers: the first pitch and the second pitch, divided by the common pitch. ``pitches`` is the second
+    pitch divided by the first. Return None if one of the integers would exceed 16.
     """
     found = Fraction(pitches).limit_denominator(_LARGEST_RATIO)
     if found.numerator > _LARGEST_RATIO or abs(found / Fraction(pitches) - 1) > 1e-12:

@@ -30,9 +30,10 @@ def centred_grid(
 def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float) -> float:
     """Return the smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
 
-    At a distance x from the axis, the kernel oscillates with x / (wavelength r) cycles/µm. This must stay
-    below the Nyquist frequency of the source grid. Sampling also creates copies of the spectrum. The
-    evanescent waves in these copies must have decayed, which sets a second limit on the distance.
+    At a lateral separation x between a source point and a target point, the kernel oscillates with x /
+    (wavelength r) cycles/µm, where r is the distance between the two points. This frequency must stay below
+    the Nyquist frequency of the source grid. Sampling also creates copies of the spectrum. The evanescent
+    waves in these copies must have decayed at the target, which sets a second limit on the distance.
     """
     limit = 0.0
     for axis in range(2):

@@ -15,8 +15,8 @@ class Stroke(Record):
     """Printed heights of the levels, and the efficiencies of a blazed grating whose periods consist of these
     levels.
 
-    ``print_gain`` is the printed height range divided by the nominal one. If this gain is not positive,
-    ``levels_for_one_wave`` and ``level_height_for_one_wave_um`` are None.
+    ``print_gain`` is the printed height range divided by the nominal height range. If this gain is not
+    positive, ``levels_for_one_wave`` and ``level_height_for_one_wave_um`` are None.
     """
 
     printed_height_um: list[float]

@@ -188,7 +188,7 @@ def element_field(
     The wave is u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
     elsewhere. For a Gaussian beam, u is multiplied by the amplitude of the beam; for a near point source, the
     phase of its spherical wave is added. The wave is scaled so that sum |u|^2 dy dx = 1. The sum of |u|^2 dy
-    dx over a window is therefore a share of the incident power. For a thick element in air,
+    dx over a window is therefore the share of the incident power in this window. For a thick element in air,
     ``wave_through_relief`` replaces the phase delay of the heights.
 
     Args:

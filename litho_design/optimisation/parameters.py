@@ -76,8 +76,8 @@ class CellMap(nn.Module):
 class GumbelLevels(nn.Module):
     """One categorical distribution over levels for each cell, sampled with Gumbel-Softmax.
 
-    A sample is the mean level, weighted with the sampled weights of the levels (Jang, Gu and Poole 2017,
-    arXiv:1611.01144).
+    A sample of a cell is the weighted mean of all levels, with randomly drawn weights (Jang, Gu and Poole
+    2017, arXiv:1611.01144).
     """
 
     # The learning rate is multiplied by this factor. It is 1, because logits, unlike levels, have no range to
@@ -107,8 +107,8 @@ class GumbelLevels(nn.Module):
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
-        """Centre the distributions on real levels of shape (*cells), plus Gaussian noise with the standard
-        deviation ``jitter_levels``.
+        """Centre the distributions on real-valued levels of shape (*cells), to which Gaussian noise with the
+        standard deviation ``jitter_levels`` is added.
         """
         levels = _jittered(levels.to(self.logits), jitter_levels, seed, self.levels)
         ladder = torch.arange(self.levels, device=self.logits.device).view(-1, *[1] * levels.dim())
@@ -125,7 +125,7 @@ class GumbelLevels(nn.Module):
 
 
 class DirectLevels(nn.Module):
-    """One real level per cell. The levels are filtered if the layout has a cell filter.
+    """One real-valued level per cell. The levels are filtered if the layout has a cell filter.
 
     A sample with ``hard=True`` has rounded levels. Its gradient is computed as if the levels had not been
     rounded (straight-through estimator).
@@ -156,8 +156,8 @@ class DirectLevels(nn.Module):
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
-        """Start at real levels of shape (*cells), plus Gaussian noise with the standard deviation
-        ``jitter_levels``.
+        """Start at real-valued levels of shape (*cells), to which Gaussian noise with the standard deviation
+        ``jitter_levels`` is added.
         """
         self.height.copy_(_jittered(levels.to(self.height), jitter_levels, seed, self.levels))
 
@@ -169,8 +169,8 @@ class DirectLevels(nn.Module):
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Return the levels clamped to their range. A step of the optimiser may move levels out of this
-        range, and ``project`` need not follow.
+        """Return the levels clamped to their range. A step of the optimiser may have moved levels out of this
+        range, and ``project`` may not have been called after the step.
         """
         return self._filtered().clamp(0, self.levels - 1)
 

@@ -41,14 +41,14 @@ def gerchberg_saxton(
 
     Each step replaces the propagated amplitude inside the output window by the target amplitude and keeps the
     wave outside the window unchanged. The adjoint of the propagator carries this correction back to the
-    element, and the corrected wave is projected onto the waves that an element with one phase per cell can
-    produce in the given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the
-    element, P is the propagator, ``a`` is the target amplitude, and Pi is the projection. The norm of P is at
-    most one, so each step minimises an upper bound of the squared amplitude error, and the error never rises
-    (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises
-    the target amplitude where light is missing. With this form, the image is more uniform, but the error may
-    rise. The initial phases are drawn at random within one radian of pi. If the levels span a full wave, pi
-    is the middle of their range.
+    element. The corrected wave is then projected onto the set of waves that an element with one phase per
+    cell can produce in the given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind
+    the element, P is the propagator, ``a`` is the target amplitude, and Pi is the projection. The norm of P
+    is at most one, so each step minimises an upper bound of the squared amplitude error, and the error never
+    rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913)
+    raises the target amplitude where light is missing. With this form, the image is more uniform, but the
+    error may rise. The initial phases are drawn at random within one radian of pi. If the levels span a full
+    wave, pi is the middle of their range.
 
     Args:
         propagator: propagator with an adjoint, such as ``RSPropagator``, on square grids with the pixel pitch
@@ -123,8 +123,8 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels whose printed phases are nearest to the phase of a lens. First, a constant is added
-    to the phase of the lens, namely the constant with which the least light is lost.
+    """Add a constant to the phase of a lens, and return the levels whose printed phases are nearest to the
+    sum. The constant is chosen such that the least light is lost.
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
     determines which cells have phases in this gap. Of 24 constants, the one with the largest amplitude at the

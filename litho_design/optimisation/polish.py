@@ -21,9 +21,9 @@ def polish_levels(
     levels: Tensor, cells: CellMap, objective: Objective, *, level_count: int, rounds: int
 ) -> tuple[Tensor, list[float]]:
     """Improve an integer layout by changing the levels of cells by one. The loss never rises. The gradient of
-    the loss predicts how much each change would lower the loss. In each round, the best changes, for a
-    certain share of the cells, are made together. If the loss of the changed layout is not lower, the changes
-    are discarded and this share is halved.
+    the loss predicts how much each change would lower the loss. Each round changes a certain share of the
+    cells together, namely the cells for which the predicted decrease of the loss is largest. If the loss of
+    the changed layout is not lower, the changes are discarded and the share is halved.
 
     Args:
         levels: level of each cell, an int64 tensor with one value per cell.
@@ -56,8 +56,8 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """Estimate, to first order, how much the loss falls if the level of one cell changes by one in the better
-    direction.
+    """For each cell, estimate to first order how much the loss falls if only the level of this cell changes
+    by one, in the better direction.
 
     Returns:
         The decrease of the loss for each cell, the change of its level (-1 or +1), and the loss of the

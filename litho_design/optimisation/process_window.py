@@ -1,5 +1,5 @@
-"""The process window, which describes random deviations of prints from the model's prediction, and of optics
-from the settings. The module also measures the disagreement of several models.
+"""The process window. It describes random deviations of prints from the model's prediction and random
+deviations of the optics from the settings. The module also measures the disagreement of several models.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelengt
 class ProcessWindow(Record):
     """The standard deviations with which prints and optics vary, and the way in which a search uses them.
 
-    ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
-    blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
-    iteration. The search minimises the mean loss over the worst draws; ``tail`` is the share of all draws
-    that count as the worst. The default spreads are guesses; replace them with the spreads of your printer.
-    In one measured data set, the gain varies by 13 % between write fields, but part of this variation comes
-    from the changing scale of the microscope.
+    ``gain_sd`` is relative to the printed height. The width of the additional blur has a half-normal
+    distribution with the scale ``blur_sd_um``. If ``samples`` is above 0, a search uses this number of draws,
+    which are the same in every iteration. The search minimises the mean loss over the worst draws; ``tail``
+    is the share of all draws that count as the worst. The default spreads are guesses; replace them with the
+    spreads of your printer. In one measured data set, the gain varies by 13 % between write fields, but part
+    of this variation comes from the changing scale of the microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -76,8 +76,8 @@ class ProcessWindow(Record):
 
 
 def _without_idle_defocus(window: ProcessWindow, optics: Optics) -> ProcessWindow:
-    """Return the window without a defocus if the light is observed in the far field. There, the image always
-    lies in the focal plane, and another focal length would only rescale it.
+    """If the light is observed in the far field, return a copy of the window without defocus. In the far
+    field, the image always lies in the focal plane, and another focal length would only rescale it.
     """
     far = optics.propagation == "far-field"
     return window.model_copy(update={"defocus_sd_um": 0.0}) if far else window
@@ -116,7 +116,7 @@ class Draw:
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
     """Return ``count`` draws of the process window with the seed ``window.seed``. A longer list begins with
-    the draws of a shorter one.
+    the same draws as a shorter list.
 
     If ``unseen`` is True, the draws come from a separate random stream. This is needed for the yield, which
     must be measured on draws that no search has used.
@@ -177,9 +177,9 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 def allowed_defocus_um(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
-    """Return the spread of the defocus in ``window``, µm, if light can then be propagated for all draws.
-    Otherwise, return the largest spread for which this is possible, rounded down to two digits. Return 0 if
-    the distance itself is too small.
+    """Return the spread of the defocus in ``window``, µm, if light can be propagated for all draws with this
+    spread. Otherwise, return the largest spread for which this is possible, rounded down to two digits.
+    Return 0 if the distance itself is too small.
     """
     drawn = _all_draws(window, optics)
     limit_um = _limit_um(drawn, optics, source, target)
@@ -271,8 +271,9 @@ def risk(losses: Tensor, tail: float) -> Tensor:
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """Return the disagreement, µm, of several models about a print. It is the rms, over the area, of the
-    standard deviation between the heights that the models predict at a point.
+    """Return the disagreement, µm, of several models about a print. At each point, the standard deviation of
+    the heights that the models predict is computed. The disagreement is the rms of this standard deviation
+    over the area.
 
     The result is differentiable. The mean of every print is subtracted first, because a constant height
     causes only a constant phase.

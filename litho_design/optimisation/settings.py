@@ -93,7 +93,7 @@ class EnsemblePenalty(Record):
     """The penalty on the disagreement of several models.
 
     A search minimises the largest loss that any model predicts, plus ``weight`` times the disagreement of the
-    models in waves.
+    models. The disagreement is given in waves.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})

@@ -62,7 +62,7 @@ class RunRecord(RunFacts):
 class Findings(Record):
     """What a task reports about the levels of the finished design and about their predicted print.
 
-    ``thick`` contains the scores of the same print, computed as a thick element.
+    ``thick`` contains the scores of the same print if it is treated as a thick element.
     """
 
     tiling: TilingCheck | None = None

@@ -48,8 +48,8 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result, a printer is a virtual fab, which provides no
-            gradients and can only judge, or the weights of a model changed during the run.
+        InputError: ``out`` holds another design or result; a printer is a virtual fab, which provides no
+            gradients and can only judge; or the weights of a model changed during the run.
     """
     settings, folder = task.settings, Path(out)
     for printer in task.printers:
@@ -229,9 +229,9 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Estimate how long, in seconds, the run takes after the search, when the layout is chosen, and the
-    scores and the yield are computed. For this estimate, each model predicts one print, one draw of the
-    process window is computed, and both are timed.
+    """Estimate the time, in seconds, that a run needs after the search to choose the layout and to compute
+    the scores and the yield. For this estimate, one prediction by each model and the scores of one draw of
+    the process window are timed.
     """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()

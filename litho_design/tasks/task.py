@@ -164,8 +164,8 @@ class Task:
 
     def untouched(self) -> dict[str, Tensor]:
         """Return a dict from names to uncorrected layouts of shape (size, size). By default, there is one
-        such layout: the start of a search for a printer that prints nominal heights. If the only start is
-        random, there is none.
+        such layout: the layout from which a search starts if the printer prints nominal heights. If every
+        start is random, the dict is empty.
         """
         if set(self.starts) == {"random"}:
             return {}
@@ -175,8 +175,8 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses according to several models into one loss. ``losses`` has shape (models,). By
-        default, return the maximum.
+        """Combine the losses of several models into one loss. ``losses`` has shape (models,). By default,
+        return the maximum.
         """
         return losses.max()
 
@@ -263,8 +263,8 @@ class Task:
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
         """Return the efficiency of an ideal element, or None if the task defines no ideal element. The ideal
-        element is searched for, starting from the print, which is given as heights in µm of shape (size,
-        size).
+        element is found by a search that starts from the print. The print is given as heights in µm of shape
+        (size, size).
         """
         return None
 
@@ -276,8 +276,8 @@ class Task:
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Return a picture of ``seen`` for reports: the images tiled in a square, each divided by its
-        brightest value.
+        """Return a picture of ``seen`` for reports. Each image is divided by its brightest value, and the
+        images are tiled in a square.
         """
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))

@@ -24,8 +24,8 @@ class Width(Record):
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
         figure: name of the main score, which is the first headline score of the task.
         less: True if the main score is better when lower.
-        loss_unit: factor that converts the loss to the unit of the main score. It is None unless the loss
-            already contains the expected error of the model's prediction.
+        loss_unit: factor that converts the loss to the unit of the main score. It is given only if the loss
+            contains the expected error of the model's prediction; otherwise, it is None.
         level_heights_um: for each model, the printed height of a wide uniform field of each level.
     """
 
@@ -47,8 +47,9 @@ class Width(Record):
     @property
     def between(self) -> tuple[float, float]:
         """Return the range in which the main score of a real print is expected. This range covers the values
-        v that the models predict. If ``loss_unit`` is set, the expected error e of each model is known. Each
-        value v is then replaced by the interval from sqrt(v^2 - (2e)^2) to sqrt(v^2 + (2e)^2).
+        v that the models predict. If ``loss_unit`` is set, the loss of each model also contains the expected
+        error e of the model. The range then covers, for each model, the interval from sqrt(v^2 - (2e)^2) to
+        sqrt(v^2 + (2e)^2).
         """
         values = self.values()
         if self.loss_unit is None:
