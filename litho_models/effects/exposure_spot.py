@@ -57,8 +57,8 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that leaks in from the neighbourhood of each pixel: D = (M + η G_b * M) / (1 + η), where
-    G_b is a Gaussian of standard deviation b.
+    """Add the dose that leaks in from the neighbourhood of each pixel: D = (M + η G_b * M) / (1 + η), where η
+    is the weight of this dose and G_b is a Gaussian of standard deviation b.
     """
     weight, length = values["weight"], values["length_um"]
     blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))

@@ -33,8 +33,8 @@ _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
     separating="print one layout at the centre and at the edge of the write field",
 )
 def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Reduce the dose towards the edge of the write field: D = M (1 - v r² / R²), where R is half the width
-    of the write field.
+    """Reduce the dose towards the edge of the write field: D = M (1 - v r² / R²), where r is the distance
+    from the centre of the write field and R is half the width of the write field.
     """
     y, x = context.centred_um()
     return layout * (1 - values["strength"] * (y * y + x * x) / context.radius_um() ** 2)
@@ -68,8 +68,8 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
     needs=("order",),
 )
 def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the dose drift from field to field: D = M (1 + ρ t), where t is the position of the field in the
-    writing order, from -0.5 to 0.5.
+    """Let the dose drift from field to field: D = M (1 + ρ t), where ρ is the relative drift over all fields
+    and t is the position of the field in the writing order, from -0.5 to 0.5.
     """
     return layout * (1 + values["drift"] * context.order)
 
@@ -148,10 +148,10 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
 )
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), where x is measured from the centre of a
-    printed field of half width r.
+    printed field of half width r, and R is half the width of the write field.
 
-    Over a write field of half width R, the full displacement is c x (1 - x / 2R). The formula leaves out the
-    part of this displacement that registration removes.
+    If x is measured from the edge of the write field instead, the full displacement is c x (1 - x / 2R). The
+    formula above leaves out the part of this displacement that registration removes.
     """
     lines_along_x = context.slow_axis == "y"
     y, x = context.scan_position()
@@ -174,8 +174,8 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     separating="print the same layout with the writing order reversed",
 )
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0), where the kernel K_l is a one-sided
-    exponential of length l along the slow axis.
+    """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0). Here e is the strength of the
+    depletion, and the kernel K_l is a one-sided exponential of length l along the slow axis.
     """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
 

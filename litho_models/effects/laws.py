@@ -2,9 +2,10 @@
 a function of the height, the slopes, the surroundings, the position in the scan or the writing order.
 
 A law is an effect with one strength (a law that adds a wave has two) and with fitted shapes, such as a power,
-a length, a direction or a position. A law names no cause of the departure. Laws are screened, fitted, judged
-and applied by the same code as other effects. A table is an effect with many strengths. A table can describe
-any dependence on one covariate, such as the level or the position, but does not explain this dependence.
+a length, a direction or a position. A law does not state the cause of the departure. Laws are screened,
+fitted, judged and applied by the same code as other effects. A table is an effect with many strengths. A
+table can describe any dependence on one covariate, such as the level or the position, but does not explain
+this dependence.
 """
 
 from __future__ import annotations

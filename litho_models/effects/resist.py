@@ -107,7 +107,8 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shrink the print inwards, at its tops more than at its bases: H(r (1 + s H(r) / H_full)). Here r is the
-    position measured from the centre of the field, and H_full is the full height.
+    position measured from the centre of the field, s is the shrinkage at the full height, and H_full is the
+    full height.
 
     The shrinkage at the mean height is a change of magnification, which registration removes. In a scan, the
     point r = x / (1 + s H_mean / H_full) of the print therefore appears at position x, where H_mean is the

@@ -1,5 +1,5 @@
 """A PyTorch ``Dataset`` of patches for your own training loop. The patches are drawn from those scans of a
-store that are not locked.
+store that are not locked, i.e. not reserved for the final test.
 """
 
 from collections.abc import Sequence

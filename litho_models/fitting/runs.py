@@ -60,8 +60,9 @@ def train(
     """Train a model on the scans of a store, and write the model and its record to a run folder. Repeating
     the call continues an interrupted run.
 
-    Locked scans are left out unless ``use_lock_box`` is set. Under ``torchrun``, the processes divide the
-    crops of each step among themselves, and only the first process writes files.
+    Locked scans, which are reserved for a final test, are left out unless ``use_lock_box`` is set. Under
+    ``torchrun``, the processes divide the crops of each step among themselves, and only the first process
+    writes files.
 
     Args:
         store: dataset store; ``model``: name of a model; ``out``: folder for the run.

@@ -1,11 +1,11 @@
 """Train models with many parameters by stochastic gradient descent on random crops, in rounds.
 
-Before each round, the per-scan terms are estimated from predictions of whole scans. The measured heights
-minus these terms are the targets of the round. After each round, the validation scans are scored and a
-checkpoint is written. Random choices depend only on the seed and the step, so an interrupted and continued
-run gives the same result as an uninterrupted one. If there are several processes, they divide the crops of
-each step among themselves and add up their gradients. The computations between two rounds are not divided:
-every process repeats them.
+Before each round, the per-scan terms (such as the zero height and the tilt of a scan) are estimated from
+predictions of whole scans. The measured heights minus these terms are the targets of the round. After each
+round, the validation scans are scored and a checkpoint is written. Random choices depend only on the seed and
+the step, so an interrupted and continued run gives the same result as an uninterrupted one. If there are
+several processes, they divide the crops of each step among themselves and add up their gradients. The
+computations between two rounds are not divided: every process repeats them.
 """
 
 import math
@@ -243,8 +243,8 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
 
 
 def validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
-    """Return the datum-free error of the model, nm, averaged over the scans. Return None if there are no
-    scans.
+    """Return the datum-free error of the model, nm, averaged over the scans. This is the error after the zero
+    height of each scan is fitted and subtracted. Return None if there are no scans.
     """
     return mean_error_nm(scans, (predict_scan(model, scan) for scan in scans)) if scans else None
 

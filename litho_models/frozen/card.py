@@ -35,7 +35,7 @@ class CardMetric(Record):
     ``policy`` the nuisance terms that were fitted, and ``background`` the background that was added to the
     predictions.
 
-    ``ci95`` is the 95 % confidence interval of the value, from resampling scans.
+    ``ci95`` is the 95 % confidence interval of the value, computed by resampling the scans.
     """
 
     name: str
@@ -150,7 +150,7 @@ class ModelCard(RunFacts, Result):
 
 
 def bounds_text(at_bounds: dict[str, float]) -> str:
-    """Return a sentence that lists the fitted values on a bound of their range."""
+    """Return a sentence that lists the fitted values that lie on a bound of their range."""
     named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
     return (
         f"These fitted values lie on a bound of their range, so the best values may lie beyond it: {named}."

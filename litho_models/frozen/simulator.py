@@ -69,7 +69,8 @@ class FrozenSimulator(nn.Module):
     @property
     def guard_px(self) -> int:
         """Return the width, in pixels, of the border of level 0 to add around an element that stands alone on
-        the substrate. The border is needed because a model assumes that a layout continues beyond its edge.
+        the substrate. Without this border, the model would assume that the outermost pixels of the element
+        continue beyond its edge.
         """
         width_um = _WIDEST_GUARD_UM if self.reach_um is None else self.reach_um
         # A receptive radius is a whole number of pixels, apart from rounding errors.

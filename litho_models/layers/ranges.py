@@ -24,8 +24,8 @@ _ROUNDING = 1e-4
 
 @dataclass(frozen=True)
 class Range:
-    """The range of one fitted value. The value is lower + (upper - lower) · sigmoid(raw) or, if there is no
-    upper bound, lower + softplus(raw).
+    """The range of one fitted value: value = lower + (upper - lower) · sigmoid(raw). If there is no upper
+    bound, value = lower + softplus(raw).
 
     Attributes:
         name: name of the value, with its unit.

@@ -1,4 +1,4 @@
-"""List the models of the printer by name, register further ones, and build them."""
+"""List the models of the printer by name, register further models, and build models."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

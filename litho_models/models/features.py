@@ -146,10 +146,10 @@ class Features(OfField, Simulator):
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the features φ(M) of the interior in two lists. The first list contains the simple features,
-        such as blurs, slopes and displaced copies. The second list contains products and cubes of these
-        features, magnitudes of gradients, and the constant 1. Each feature is a map of shape (batch, 1, ny,
-        nx).
+        """Return the features φ(M) of the interior (the pixels at least ``reach_px`` from the edge) in two
+        lists. The first list contains the simple features, such as blurs, slopes and displaced copies. The
+        second list contains products and cubes of these features, magnitudes of gradients, and the constant
+        1. Each feature is a map of shape (batch, 1, ny, nx).
         """
         config = self.config
         layout = layout_um / config.full_height_um

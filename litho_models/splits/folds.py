@@ -191,8 +191,9 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose the training scans that are set aside to select the best round of a training, and return their
-    ids. ``count`` scans are chosen, but at most a quarter of the training scans in ``ids``.
+    """Choose training scans to be set aside, and return their ids. The error on these scans decides which
+    round of a training is the best. ``count`` scans are chosen, but at most a quarter of the training scans
+    in ``ids``.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))
