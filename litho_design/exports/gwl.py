@@ -1,5 +1,5 @@
-"""Write layouts as GWL for Nanoscribe printers. In each slice, every run of adjacent pixels in a row is
-written as parallel lines.
+"""Write layouts as GWL for Nanoscribe printers. In each slice, the pixels whose levels reach the slice are
+written row by row: parallel lines fill every run of adjacent pixels.
 """
 
 from __future__ import annotations

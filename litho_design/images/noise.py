@@ -20,8 +20,8 @@ _NOISE_BAND = 0.35
 
 
 def white_noise(values: np.ndarray) -> float:
-    """Return the standard deviation of the white noise in a map of shape (ny, nx), from the highest spatial
-    frequencies of the map.
+    """Return the standard deviation of the white noise in a map of shape (ny, nx), estimated from the highest
+    spatial frequencies of the map.
     """
     window, high = _window_and_band(values.shape)
     power = np.abs(np.fft.fft2(values * window)) ** 2 / np.square(window).sum()

@@ -60,8 +60,8 @@ _TIE = 0.03
 
 
 class CameraRecord(Record):
-    """Source and processing of a photograph. If the photograph was taken through a lens, ``imaged`` is the
-    photographed object.
+    """Source and processing of a photograph. If the photograph was taken through a printed lens, ``imaged``
+    is the photographed object.
 
     ``orientation`` is the operation that brings the photograph into the orientation of the expected image.
     ``ambiguous`` lists other operations with which the photograph fits equally well. ``photo_to_window`` is a
@@ -134,7 +134,8 @@ class Photograph:
 
     Attributes:
         counts: counts of the cleaned, upright photograph minus the dark level, shape (ny, nx).
-        window_to_photo: projective map from window pixels to photograph pixels, a matrix of shape (3, 3).
+        window_to_photo: projective map from pixels of the window to pixels of the photograph, a matrix of
+            shape (3, 3). The window is the area of the expected image.
         side_px: side of the window, in window pixels.
         pitch_um: side length of a window pixel.
         finest_per_um: the highest spatial frequency that the image can have, in cycles/µm.
@@ -357,8 +358,8 @@ def _saturated(raw: np.ndarray) -> float:
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
     at_top = float((raw == top).mean())
-    # If many pixels have the highest count and few others come close to it, it is the end of the camera's
-    # range.
+    # If many pixels have the highest count and few others come close to it, this count is the end of the
+    # camera's range.
     beside = float(((raw < top) & (raw >= top - max(1, top // 500))).mean())
     return at_top if top in ends or at_top > max(4 * beside, _LARGEST_SATURATED) else 0.0
 
@@ -408,8 +409,8 @@ def _check_orientation(
     shrink = max(1, wanted.shape[0] // _SMALL_PX)
     side = wanted.shape[0] // shrink
     small: Any = cv2.resize(wanted, (side, side), interpolation=cv2.INTER_AREA)
-    # The photograph is averaged over pixels as large as those of the reduced expected image, so that its
-    # noise does not decide.
+    # The photograph is averaged over pixels as large as those of the reduced expected image, so that
+    # the noise of the photograph does not influence which orientation fits best.
     finer = max(1, round(wanted.shape[0] / side / scale))
     counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
     small_scale = scale * side / wanted.shape[0]

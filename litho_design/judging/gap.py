@@ -1,5 +1,5 @@
-"""Records of the design-to-manufacturing gap. Each arm (a model used for design) makes one design per seed,
-and each judge (another or the same model) predicts the prints of all designs, which are then scored.
+"""Records of the design-to-manufacturing gap. Each arm (a model used for design) makes one design per seed.
+Each judge (the same model or another model) predicts the prints of all designs, and these prints are scored.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """Return the differences in the given scores between every two arms, according to each judge."""
+    """Return the differences in the given scores, for every pair of arms and every judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))

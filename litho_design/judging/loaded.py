@@ -1,4 +1,6 @@
-"""Read a finished design from its folder, so that any model can predict its print, which is then scored."""
+"""Read a finished design from its folder. Any model can then predict the print of the design, and this print
+can be scored.
+"""
 
 from __future__ import annotations
 
@@ -51,14 +53,13 @@ class LoadedDesign:
         folder: a design folder; its arrays are checked against the hashes in the record. For a lens of rings,
             levels and heights are given along a radius, not over a plane.
         device: where prints and waves are computed.
-        element: ``thin`` or ``thick``, to be used instead of the kind of element in the record (see
-            ``Optics``).
+        element: ``thin`` or ``thick``; replaces the kind of element that the record states (see ``Optics``).
         band_px: if given, the print of a large hologram is predicted and scored in bands of at most this many
             rows.
 
     Raises:
         InputError: the folder is incomplete or was altered, the task is not registered here, this machine
-            does not have the device, or bands are requested for something other than a thin hologram.
+            does not have the device, or bands are requested although the design is not a thin hologram.
     """
 
     def __init__(

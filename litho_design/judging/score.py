@@ -111,8 +111,8 @@ class Judgement:
         pictures: mapping from titles to the images that reports show, shape (m, m): the target image, and the
             image or PSF behind each print.
         side_um: width of the images in ``pictures``, µm.
-        photos: for a photographed lens, mapping from titles to images of shape (n, n): the object, the
-            photograph and the reconstructions.
+        photos: for a photograph taken through a printed lens, mapping from titles to images of shape (n, n):
+            the object, the photograph and the reconstructions.
         frame_um: width of the images in ``photos``, µm.
     """
 

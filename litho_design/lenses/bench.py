@@ -30,11 +30,12 @@ CENTRE_UM = 1.0
 
 class LensOptics(nn.Module):
     """Base class of ``LensBench``, which computes on a plane, and ``RadialLensBench``, which computes on
-    rings. It provides the numerical aperture, the focal window and the heights of a perfect lens to both.
+    rings. Both inherit the numerical aperture, the focal window (the pixels around the focus) and the heights
+    of a perfect lens.
 
     Raises:
         InputError: the source is not a distant, monochromatic point source, or the focal window is smaller
-            than the central box.
+            than the central box, from which the centre-to-background ratio is computed.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):

@@ -1,4 +1,6 @@
-"""Run any task: search for a layout, polish it, score it and write the result. Interrupted runs resume."""
+"""Run any task: search for a layout, polish it (change levels by one to lower the loss), score it and write
+the result. Interrupted runs resume.
+"""
 
 from __future__ import annotations
 
@@ -136,7 +138,7 @@ def _make(
 @torch.no_grad()
 def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
     """Return the layout with the smallest loss according to all available models (``Task.over_models``). The
-    candidates are the layout found by the search and the uncorrected layouts.
+    candidates are the layout found by the search and the uncorrected layouts (``Task.untouched``).
 
     Args:
         searched: levels that the search found, on the pixels of the layout, shape (size, size).

@@ -294,8 +294,8 @@ class Task:
     def scenes(self) -> list[tuple[Draw | None, Any]]:
         """Return one pair for each draw of the process window that enters the loss: the draw and its bench.
 
-        If the loss uses no draws, the list contains one pair. It has None instead of a draw, and its bench is
-        used with the print that the model predicts.
+        If the loss uses no draws, the list contains one pair. This pair consists of None and the bench for
+        the optics in the settings.
         """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)

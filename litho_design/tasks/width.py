@@ -1,5 +1,5 @@
 """The width of a design, i.e. how much different models disagree about the score of its layout. Uncorrected
-layouts are scored for comparison.
+layouts, which are designed for a printer that prints nominal heights, are scored for comparison.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ class Width(Record):
 
     Attributes:
         searched_with: number of models that the search used.
-        figures: for each candidate and each model, the scores, keyed by name; one of these is ``loss``. The
-            candidates are the layout found by the search and the uncorrected layouts.
+        figures: scores of each candidate according to each model, keyed by name. One of the scores is
+            ``loss``. The candidates are the layout found by the search and the uncorrected layouts.
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
         figure: name of the main score, which is the first headline score of the task.
         less: True if the main score is better when lower.
