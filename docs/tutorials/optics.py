@@ -1,7 +1,7 @@
 # %% [markdown]
 # # A hologram through the printer
 #
-# You want a printed element to show an image. On this page you design such an element through a model of the printer,
+# You want a printed element to show an image. On this page you design such an element with a model of the printer,
 # judge it with another model, and write the file for the printer. The models come with the package.
 
 # %%
@@ -16,7 +16,7 @@ designs = {
 }
 
 # %% [markdown]
-# `without` was designed for a perfect printer, and `with` through a model trained on measured prints. A good
+# `without` was designed for a perfect printer. For `with`, a model trained on measured prints was used. A good
 # score from its own model proves nothing about a design. So another model, used for neither design, predicts
 # both prints, and their images are scored:
 
