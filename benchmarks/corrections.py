@@ -162,10 +162,10 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     named = f" ({', '.join(listed)})" if listed else ""
     median = np.median([over_idle(row) for row in rows])
     return (
-        "Each correction is compared with the layout of nominal heights or the best affine layout, whichever "
-        f"is better. Of {len(rows)} corrections, {len(worse)} have a print error more than 5 % larger{named}."
-        f" The median ratio of the errors is {median:.2f}. For a blaze, the ratio to the error of the best "
-        f"affine layout is {np.median(blazes):.2f}. "
+        "Each corrected layout is compared with the better of two others, the layout of nominal heights and "
+        f"the best affine layout. In {len(worse)} of {len(rows)} cases, the error of the corrected print is "
+        f"more than 5 % larger{named}. The median ratio of the errors is {median:.2f}. For a blaze, the "
+        f"ratio to the error of the best affine layout is {np.median(blazes):.2f}. "
         f"The errors of {len(inside)} of {len(rows)} prints lie in the range that the correction stated."
     )
 

@@ -29,7 +29,7 @@ PICTURE = "errors.png"
 _MODELS = {"base": "base model", "causes": "with the causes", "all": "with all findings"}
 _MEASURED = {
     "print alone": "nothing",
-    "published": "the shared smooth background (published protocol)",
+    "published": "the shared smooth background (protocol of the benchmark)",
     "shared": "the measurement model",
 }
 _HELD_OUT = {

@@ -129,8 +129,9 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         rows,
         f"The layouts have {size_px} × {size_px} px. The times were measured in float32 on the "
         f"{record['device']} with {record['threads']} thread{'s' * (record['threads'] > 1)} and torch "
-        f"{record['versions']['torch']}. They are {clock} times and medians of {REPEATS} runs. The times "
-        "of training are wall-clock times on a computer that did other work at the same time.",
+        f"{record['versions']['torch']}. The times of prediction and design are {clock} times and "
+        f"medians of {REPEATS} runs. The times of training are wall-clock times on a computer that did other "
+        "work at the same time.",
     )
 
 

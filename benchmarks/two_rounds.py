@@ -248,9 +248,9 @@ def summary(trials: list[dict[str, Any]]) -> str:
         ),
         rows,
         f"In {with_question} of the {len(trials)} trials, the first round left a question about the hidden "
-        f"cause. The predicted power is that of {PRINTS} prints. Brackets contain 95 % Wilson intervals of "
-        "the share decided correctly. For the questions in the last column, the plan stated before printing "
-        "that no experiment separates the answers.",
+        f"cause. The predicted power is the power of {PRINTS} prints. Brackets contain 95 % Wilson intervals "
+        "of the share decided correctly. For the questions in the last column, the plan stated before "
+        "printing that no experiment separates the answers.",
         "With the optimised layouts, the questions about each hidden cause were decided correctly in this "
         f"many trials: {_by_knob(trials)}.",
     )

@@ -67,7 +67,7 @@ def dose_table(found: NoiseAnalysis) -> str:
         ),
         rows,
         f"Recommended dose: {found.dose.recommended_dose:g}. Reason: {found.dose.reason}. Scans left out of "
-        f"the other estimates, with the reason: {', '.join(found.run.dropped)}.",
+        f"the other estimates (scan: reason): {', '.join(found.run.dropped)}.",
     )
 
 

@@ -65,9 +65,9 @@ def uncertainties(record: dict[str, Any]) -> list[str]:
     ratios, shares = [one["sd"] for one in large], [100 * one["within_68"] for one in large]
     return [
         f"deviation of {min(ratios):.2f} to {max(ratios):.2f}",
-        f"{min(shares):.0f} to {max(shares):.0f} % of the pixels lie within 1 σ",
-        f"this deviation is {worst['sd']:.2f}, and a single scan was off by "
-        f"{max(worst['sd_of_scans']):.1f} σ",
+        f"the error of {min(shares):.0f} to {max(shares):.0f} % of the pixels is below 1 σ",
+        f"this standard deviation is {worst['sd']:.2f}; in one of {worst['scans']} scans, it is "
+        f"{max(worst['sd_of_scans']):.1f}",
     ]
 
 
@@ -77,7 +77,7 @@ def readers(record: dict[str, Any]) -> list[str]:
     slowest = max(one["longest_s"] for one in bodies)
     return [
         f"Of {len(files)} files from other programs {sum(not one['refused'] for one in files)} were read",
-        f"50,000 files of random bytes after one of {len(bodies)} signatures were all refused; "
+        f"50,000 files, each with one of {len(bodies)} signatures and then random bytes, were all refused; "
         f"the slowest took {slowest:.1f} s",
     ]
 

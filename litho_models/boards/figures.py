@@ -132,7 +132,7 @@ def _of_singles(trials: Sequence[Trial]) -> list[Figure]:
         _causes("… noticed, with or without a name or law", counted(other), _SEEN, "all but one"),
         Figure("… trials with a false name", share(bool(one.false_names) for one in other), "at most 1"),
         Figure(
-            f"all others: error of at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
+            f"all other trials: error of at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
             share(map(reaches_floor, rest)),
             "at least 90 %",
         ),

@@ -134,8 +134,8 @@ def test_a_correction_of_another_size_is_not_used(tmp_path, monkeypatch):
 def test_the_table_says_which_corrections_are_worse(rows):
     better = [{**row, "printed_nm": {**row["printed_nm"], "corrected": 1.0}} for row in rows]
     told = as_markdown({"rows": better, "size_px": 64})
-    assert f"Of {len(rows)} corrections, 0 have a print error more than 5 % larger" in told
+    assert f"In 0 of {len(rows)} cases, the error of the corrected print is more than 5 % larger" in told
     better[0]["printed_nm"]["corrected"] = 999.0
     told = as_markdown({"rows": better, "size_px": 64})
-    assert "corrections, 1 have a print error more than 5 % larger" in told
+    assert f"In 1 of {len(rows)} cases, the error of the corrected print is more than 5 % larger" in told
     assert "more than 5 % larger (cap by hidden 5" in told
