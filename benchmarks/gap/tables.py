@@ -159,12 +159,12 @@ def lead_text(
         low, high = sorted(turn * end for end in item["ci95"])
         open_ = "" if low * high > 0 else ", which includes 0"
         interval = f"({low:.{digits}f} to {high:.{digits}f}{open_})"
-        designs = "designs without a model" if other == "none" else other
-        against.append(f"{turn * item['mean']:.{digits}f} {interval} over {designs}")
+        designs = "without a model" if other == "none" else f"with {other}"
+        against.append(f"{turn * item['mean']:.{digits}f} {interval} than {designs}")
     name, _, unit = LABELS[figure].removesuffix(")").partition(" (")
     return (
-        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. Their "
-        f"lead{f' in {unit}' if unit else ''}, with its 95 % interval, is {'; '.join(against)}."
+        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. It is "
+        f"better by these differences{f' in {unit}' if unit else ''} (95 % interval): {'; '.join(against)}."
     )
 
 

@@ -149,7 +149,7 @@ def _without_each(blocks: Array) -> tuple[Array, Array]:
     """Return the mean and the jackknife (leave-one-block-out) covariance of the fitted coefficients, computed
     from per-block inner products of shape (blocks, k, k).
 
-    The coefficients of the warp are divided by the gain.
+    Of the fitted coefficients, those of the warp are first divided by that of the gain.
     """
     without = solve_gram(blocks.sum(axis=0) - blocks)
     without[:, NUISANCES:] /= without[:, :1]

@@ -277,7 +277,7 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
             f"scan {scan.source} on the layout of the design",
             got=quality.reason,
             wanted="a match",
-            hint="use --scan-aligned if it lies on the pixels of the element",
+            hint="use --scan-aligned if the scan has the pixels of the element",
         )
     height, valid = resample_to_layout(
         scan.height_um, found.scan_to_layout, level.shape, **pitches, bend_um=found.bend_um

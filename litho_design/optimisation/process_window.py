@@ -280,7 +280,8 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
     Args:
         heights_um: prints of one layout by k models, shape (k, ...).
-        area: for rings, the area that each height covers, in any unit, shape (...); None for pixels.
+        area: weight of each height, shape (...): for rings, their area in any unit; None if all heights count
+            equally, as for pixels.
     """
     flat = heights_um.flatten(1)
     share = flat[0].new_ones(flat[0].shape) if area is None else area.flatten()

@@ -160,7 +160,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     assert "| 100 % |" in text
     assert "| 58 % |" in text
     assert "those designed with pbl have the best" in text
-    assert "2.000 (-0.500 to 4.500, which includes 0) over designs without a model" in text
+    assert "2.000 (-0.500 to 4.500, which includes 0) than without a model" in text
 
 
 def test_the_page_quotes_the_committed_comparison():
