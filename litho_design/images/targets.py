@@ -189,7 +189,11 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     for row in range(-3, 4):
         for column in range(-3, 4):
             if (row, column) != (0, 0):
-                picture[np.hypot(y - 0.11 * row, x - 0.11 * column) < 0.016] = 1
+                # No pixel outside these rows and columns is near enough.
+                off_y, off_x = y[:, 0] - 0.11 * row, x[0] - 0.11 * column
+                rows, columns = (np.flatnonzero(np.abs(off) < 0.016) for off in (off_y, off_x))
+                near = np.hypot(off_y[rows, None], off_x[columns]) < 0.016
+                picture[rows[:, None], columns] = near
     return picture
 
 
