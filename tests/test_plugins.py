@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
 from operator import methodcaller
 from pathlib import Path
 
@@ -17,10 +18,18 @@ from examples.own_reader import write_toy
 from litho_data.foundation import plugins
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
+from litho_data.readers import registry
 from litho_data.sharing.workers import Workers, run_jobs
+from litho_design.tasks import task
+from litho_models.effects import CATALOGUE
+from litho_models.fitting import small_models
+from litho_models.loop import closing
+from litho_models.models import MODELS
+from litho_models.scan_terms import SCAN_TERMS
+from litho_models.scoring import metric_registry
+from tests.litho_models.loop_scans import search_little
 from tests.litho_models.prints import make_scans, write_store
 
-ROOT = Path(__file__).parents[1]
 ENTRY = "[litholoop.plugins]\nown-lab = own_lab\n"
 MODULE = """
 from examples.own_effect import register
@@ -36,38 +45,14 @@ register_reader(TOY)
 register_simulator(TwoSpots)
 register_metric("off_by_half_a_level", "percent", share_off_by_half_a_level, "off_by_half_a_level: a share.")
 """
-# Run all commands in one process, because separate processes would spend most of their time on imports.
-COMMANDS = """
-import importlib, sys
-import pytest
-from tests.figures import undrawn
-def run(*words):
-    sys.argv = [str(word) for word in words]
-    try:
-        importlib.import_module(words[0].replace("-", "_") + ".cli.app").main()
-    except SystemExit as stop:
-        assert not stop.code, words
-def every_command():
-    loop = "close-loop prints.zarr --base two-spots --folds 2 --out loop"
-    bench = "benchmark prints.zarr --models two-spots --folds 2 --out bench"
-    run("litho-data", "inspect", "scan.afm")
-    run("litho-models", "train", "prints.zarr", "--model", "two-spots", "--out", "run")
-    run("litho-models", "freeze", "run", "--out", "printer")
-    run("litho-models", *bench.split())
-    # Of all the effects that a loop tries, only the own one.
-    from litho_models.loop import closing
-    from tests.litho_models.loop_scans import search_little
-    every = closing.screened_effects
-    search_little(pytest.MonkeyPatch())
-    closing.screened_effects = lambda tip: [one for one in every(tip) if one.name == "sinking-layers"]
-    run("litho-models", *loop.split())
-    few = "--size-px 32 --distance-um 20 --iterations 2 --set search.polish_rounds=0 --out"
-    run("litho-design", "compare", *"--models printer --seeds 1".split(), *few.split(), "gap")
-    from litho_design.tasks.task import registered_task
-    print(registered_task("colours-in-planes"))
-if __name__ == "__main__":
-    with undrawn():
-        every_command()
+COMMANDS = """\
+litho-data inspect scan.afm
+litho-models train prints.zarr --model two-spots --out run
+litho-models freeze run --out printer
+litho-models benchmark prints.zarr --models two-spots --folds 2 --out bench
+litho-models close-loop prints.zarr --base two-spots --folds 2 --out loop
+litho-design compare --models printer --seeds 1 --set search.polish_rounds=0 --set window.yield_draws=2 \
+--size-px 32 --distance-um 20 --iterations 2 --out gap
 """
 # A number that says which plug-ins are loaded in its process.
 OWN = """
@@ -79,13 +64,21 @@ class Number(int):
 
 
 @pytest.fixture
-def unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unload the plug-ins that a test has loaded."""
+def unknown(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Unload the plug-ins that a test has loaded, and what they have registered."""
     monkeypatch.setattr(plugins, "_LOADED", {})
-    before = set(sys.modules)
+    modules = set(sys.modules)
+    held = (
+        *(registry._READERS, registry._REGISTERED, task._TASKS, metric_registry._MEASUREMENTS),
+        *(MODELS, CATALOGUE, SCAN_TERMS),
+    )
+    before = [(own, own.copy()) for own in held]
     yield
-    for name in set(sys.modules) - before:
-        if name.startswith("own_"):
+    for own, entries in before:
+        own.clear()
+        own.update(entries) if isinstance(own, dict) else own.extend(entries)
+    for name in set(sys.modules) - modules:
+        if name.startswith(("own_", "examples.own_")):
             del sys.modules[name]
 
 
@@ -99,20 +92,31 @@ def installed(site: Path, code: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_an_installed_plugin_registers_is_used_by_every_command(tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    installed(site, MODULE)
+def test_what_an_installed_plugin_registers_is_used_by_every_command(
+    tmp_path: Path,
+    unknown: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    installed(tmp_path / "site", MODULE)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.chdir(tmp_path)
     write_store(tmp_path / "prints.zarr", make_scans(4, 48))
     write_toy(tmp_path / "scan.afm", 100 * np.random.default_rng(0).random((32, 32)), (3.2, 3.2))
-    (tmp_path / "commands.py").write_text(COMMANDS)
-    environment = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "commands.py"],
-        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "toy" in done.stdout
-    assert "ColoursInPlanes" in done.stdout
+    # One step of each fit, and of all the effects that a loop tries only the own one.
+    monkeypatch.setattr(small_models, "RULES", replace(small_models.RULES, steps=1))
+    every = closing.screened_effects
+    search_little(monkeypatch)
+    monkeypatch.setattr(
+        closing, "screened_effects", lambda tip: [one for one in every(tip) if one.name == "sinking-layers"]
+    )
+    for line in COMMANDS.splitlines():
+        monkeypatch.setattr(sys, "argv", line.split())
+        with pytest.raises(SystemExit) as stop:
+            import_module(f"{sys.argv[0].replace('-', '_')}.cli.app").main()
+        assert not stop.value.code, line
+    assert "toy" in capsys.readouterr().out
+    assert task.registered_task("colours-in-planes").__name__ == "ColoursInPlanes"
     assert "two-spots" in set(pd.read_csv(tmp_path / "bench" / "scans.csv")["model"])
     bench = json.loads((tmp_path / "bench" / "benchmark.json").read_text())
     assert all("off_by_half_a_level_percent" in row["metrics"] for row in bench["scores"])
