@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import numpy as np
@@ -24,8 +24,19 @@ _BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAw
 
 @contextmanager
 def undrawn() -> Iterator[None]:
-    """Leave figures undrawn."""
-    with patch.object(page, "svg_address", lambda figure: _BLANK):
+    """Leave the figures of reports undrawn and without colour bars. A bar takes as long as a map."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    bar = Figure.colorbar
+
+    def colorbar(figure: Figure, *words: Any, **named: Any) -> Any:
+        return None if isinstance(figure.canvas, FigureCanvasSVG) else bar(figure, *words, **named)
+
+    with (
+        patch.object(page, "svg_address", lambda figure: _BLANK),
+        patch.object(Figure, "colorbar", colorbar),
+    ):
         yield
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -67,6 +70,24 @@ def small_settings() -> HologramSettings:
             "window": ProcessWindow(yield_draws=10),
         }
     )
+
+
+@contextmanager
+def unreported() -> Iterator[None]:
+    """Leave reports of designs unwritten. They take longer than small designs and have their own tests."""
+
+    def unwritten(folder, *_):
+        (folder / "report.html").write_text("")
+
+    place = "litho_design.workflows.{}.write_design_report"
+    with patch(place.format("design"), unwritten), patch(place.format("compare"), unwritten):
+        yield
+
+
+@pytest.fixture
+def no_report():
+    with unreported():
+        yield
 
 
 @pytest.fixture(autouse=True)

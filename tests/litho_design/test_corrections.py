@@ -16,7 +16,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.training import own_error_um
 from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.task import ReliefTask
-from tests.litho_design.conftest import BlurPrinter
+from tests.litho_design.conftest import BlurPrinter, unreported
 
 SEEDS = (5, 6)
 
@@ -72,7 +72,8 @@ def rows(tmp_path_factory):
         ]
         judge = Printer(hidden, settings.layout, source="hidden")
         place = tmp_path_factory.mktemp(f"seed{seed}")
-        found += [corrected(name, seed, models, judge, place / name, settings) for name in RELIEFS]
+        with unreported():
+            found += [corrected(name, seed, models, judge, place / name, settings) for name in RELIEFS]
     return found
 
 

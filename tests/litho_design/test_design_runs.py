@@ -31,6 +31,8 @@ from litho_design.tasks.design import Design, read_array
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
 
+pytestmark = pytest.mark.usefixtures("no_report")
+
 
 @pytest.fixture
 def target():

@@ -236,6 +236,7 @@ def require_figures_of_a_design(folder, design):
         assert draw == pytest.approx({name: wanted[name] for name in draw}, rel=1e-4)
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize(
     "task",
     [
@@ -292,6 +293,7 @@ def test_a_model_that_changes_itself_is_refused_and_leaves_no_design(
     assert not (tmp_path / "d" / "design.json").exists()
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_picture_of_another_shape_is_adapted_and_the_adaptation_is_reported(tmp_path, capsys, monkeypatch):
     picture = np.zeros((40, 90), np.uint8)
     picture[10:30, 20:70] = 200
@@ -347,7 +349,10 @@ def test_a_picture_of_another_shape_is_adapted_and_the_adaptation_is_reported(tm
         (("hoe", "--model", "none", "--risk-tail", "0", "--out", "out"), "tail"),
         (("hoe", "--model", "none", "--spread-of", "no.zarr", "--out", "out"), "no.zarr"),
         (("hoe", "--model", "none", "--judge", "b=nowhere", "--out", "out"), "nowhere"),
-        (("lens", "--model", "none", "--focal-length-um", "0.02", "--out", "out"), "propagation distance"),
+        (
+            ("lens", "--model", "none", *SMALL[:2], "--focal-length-um", "0.02", "--out", "out"),
+            "propagation distance",
+        ),
         (("hoe", "--model", "none", "--device", "abacus", "--out", "out"), "'abacus'"),
         (("hoe", "--model", "none", "--device", "cuda:99", "--out", "out"), "'cuda:99'"),
         (("lens", "--model", "none", "--size-px", "127", "--out", "out"), "even number"),

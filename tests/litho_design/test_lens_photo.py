@@ -31,6 +31,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_lens
 from litho_design.workflows.score import score as score_design
+from tests.litho_design.conftest import unreported
 
 SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
 OBJECT_PX, PHOTO_PX = 96, 160
@@ -54,7 +55,8 @@ def lens(tmp_path_factory):
         }
     )
     folder = tmp_path_factory.mktemp("lens") / "design"
-    design_lens(Printer(None, layout, source="none"), folder, settings=settings, announce=False)
+    with unreported():
+        design_lens(Printer(None, layout, source="none"), folder, settings=settings, announce=False)
     return folder
 
 

@@ -23,6 +23,7 @@ from litho_design.tasks.design import HEIGHT_FILE, Design, read_array
 from litho_design.workflows.design import design_lens
 from litho_design.workflows.score import score as score_design
 
+pytestmark = pytest.mark.usefixtures("no_report")
 SMALL = (
     *("--size-px", "128", "--window-px", "64", "--object-px", "32", "--iterations", "2"),
     *("--model", "none", "--task", "computational", "--focal-length-um", "40", "--yield-draws", "5"),

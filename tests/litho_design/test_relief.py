@@ -31,6 +31,7 @@ TINY = {
 }
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
     settings = relief_settings(TINY)
     printer = make_printer(settings.layout, sigma_um=0.15)
@@ -73,6 +74,7 @@ def test_the_baselines_use_nominal_heights_and_the_best_gain_and_offset(make_pri
         assert int(task.untouched()["uncorrected"].min()) == foot
 
 
+@pytest.mark.usefixtures("no_report")
 def test_no_correction_is_returned_if_the_available_models_prefer_it(tmp_path, make_printer):
     """Check a model with a gain of 0.4, which corrects by a factor of 2.5. Two judges print nearly the
     nominal heights.
@@ -129,6 +131,7 @@ def test_the_offset_of_a_print_does_not_affect_the_yield(make_printer):
     assert passed(settings.window.model_copy(update={"gain_sd": 0.05}))[1].share < 0.5
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_printer, refused):
     """Check a second round for a printer whose gain falls by 20 % across the field. The gain of the model is
     constant.
