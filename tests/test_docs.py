@@ -22,12 +22,15 @@ SMALLER = {
         "count=8": "count=4",
         # There are too few scans for a confidence interval.
         "scores.mae_datum_free_ci95_nm": "scores.mae_datum_free_ci95_nm or (0.0, 0.0)",
-        '("affine", "linear", "physics"), folds=2': '("affine", "linear"), folds=2',
+        '("affine", "linear", "physics"), folds=2': '("identity", "affine"), folds=2',
         '"physics", "run"': '"affine", "run"',
     },
     "optics": {
         '"layout.size_px": 192, "optics.distance_um": 18, "search.iterations": 30': '"layout.size_px": 64, '
-        '"optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0, "window.yield_draws": 4'
+        '"optics.distance_um": 12, "search.iterations": 2, '
+        '"search.polish_rounds": 0, "window.yield_draws": 4',
+        # One further model is enough, the one that judges the designs afterwards.
+        "model, name, settings=settings": 'model, name, settings=settings, judges=["zoo:pbl"]',
     },
     "gallery": {
         "count=4": "count=2",

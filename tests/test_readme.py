@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text("utf-8")
 # Replacements that make the code run fast in the test. Each replaced text must occur on the page.
 SMALLER = {
-    "count=12, size_px=256": "count=3, size_px=128",
+    "count=12, size_px=256": "count=2, size_px=128",
     '"layout.size_px": 256': '"search.iterations": 2, "search.polish_rounds": 0, '
     '"window.yield_draws": 5, "layout.size_px": 64',
 }

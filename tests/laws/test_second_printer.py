@@ -29,7 +29,7 @@ def run(command, *words):
 def made(tmp_path_factory):
     """Make a folder with prints, their dataset, a model, a design, and the design's files for the printer."""
     folder = tmp_path_factory.mktemp("second")
-    run("litho-data", "simulate", "--preset", "second-printer", "--count", 3, "--out", folder / "fab")
+    run("litho-data", "simulate", "--preset", "second-printer", "--count", 2, "--out", folder / "fab")
     run("litho-data", "build", folder / "fab" / "raw" / "card.toml", "--out", folder / "prints.zarr")
     run("litho-models", "train", folder / "prints.zarr", "--model", "affine-mtf", "--out", folder / "run")
     run("litho-models", "freeze", folder / "run", "--out", folder / "printer")

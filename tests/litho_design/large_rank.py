@@ -19,7 +19,7 @@ from litho_design.reports.design import write_design_report
 from litho_design.tasks.run import run_design
 from tests.litho_design.conftest import BlurPrinter
 
-SIZE, BAND, ITERATIONS = 160, 32, 20
+SIZE, BAND, ITERATIONS = 160, 32, 14
 
 
 def settings(iterations: int = ITERATIONS) -> HologramSettings:

@@ -270,8 +270,7 @@ def test_objects_of_the_score_are_held_out(objects, message):
         ImagingSettings(**objects)
 
 
-@pytest.mark.pictures
-@pytest.mark.parametrize("task", ["direct", "computational"])
+@pytest.mark.parametrize("task", ["direct", pytest.param("computational", marks=pytest.mark.pictures)])
 def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, make_printer, task):
     settings = settings.model_copy(update={"task": task})
     printer = make_printer(LAYOUT)

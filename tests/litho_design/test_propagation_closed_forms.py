@@ -97,22 +97,24 @@ def test_fresnel_zone_plate_focus_grows_with_the_square_of_its_zones():
     assert intensity == pytest.approx((2 * zones) ** 2, rel=0.02)
 
 
-@pytest.mark.parametrize(("phase_step", "efficiency"), [(0.0, 1 / math.pi**2), (math.pi, 4 / math.pi**2)])
-def test_first_order_of_a_zone_plate(phase_step, efficiency):
-    # The efficiency is the intensity at the focus relative to that of a perfect lens of the same aperture.
-    z, count = 300.0, 40
+def test_first_order_of_a_zone_plate():
+    """Check plates that block every second zone, and plates that delay it by half a wave.
+
+    The efficiency is the intensity at the focus relative to that of a perfect lens of the same aperture.
+    """
+    z, count = 100.0, 40
     edges = [math.sqrt((z + m * WAVELENGTH_UM / 2) ** 2 - z**2) for m in range(count + 1)]
-    grid = centred_grid((1760, 1760), 0.1)
+    grid = centred_grid((1050, 1050), 0.1)
     r = radius(grid)
     inside = r < edges[-1]
     odd = ((torch.floor(((r**2 + z**2).sqrt() - z) / (WAVELENGTH_UM / 2)) % 2) == 1) & inside
-    second = np.exp(1j * phase_step) if phase_step else 0.0
-    plate = torch.where(odd, torch.tensor(second, dtype=torch.complex128), inside.to(torch.complex128))
-    lens = inside * torch.exp(-1j * WAVENUMBER * ((r**2 + z**2).sqrt() - z))
     propagate = RSPropagator(grid, point(), z, WAVELENGTH_UM, dtype=torch.complex128)
-    # On the axis, the undiffracted and diverging orders add a stray amplitude of a few parts in ``count``.
-    ratio = abs(complex(propagate(plate)) / complex(propagate(lens))) ** 2
-    assert ratio == pytest.approx(efficiency, rel=0.02)
+    lens = complex(propagate(inside * torch.exp(-1j * WAVENUMBER * ((r**2 + z**2).sqrt() - z))))
+    for second, efficiency in ((0.0, 1 / math.pi**2), (-1.0, 4 / math.pi**2)):
+        plate = torch.where(odd, torch.tensor(second, dtype=torch.complex128), inside.to(torch.complex128))
+        # On the axis, undiffracted and diverging orders add a stray amplitude of a few parts in ``count``.
+        ratio = abs(complex(propagate(plate)) / lens) ** 2
+        assert ratio == pytest.approx(efficiency, rel=0.02)
 
 
 def test_talbot_image_shifts_by_half_a_period_at_half_the_distance():
@@ -153,7 +155,7 @@ def test_radial_path_equals_the_closed_forms_and_the_plane_path():
     # With two Gauss nodes on a 0.1 µm ring, the phase spans 0.13 rad. The error is below span^4 / 4320.
     assert abs(complex(flat[0]) - exact) / abs(exact) < 1e-6
     fine, aperture = circular_aperture(0.05, a)
-    for index, r in enumerate(radii.tolist()):
+    for index, r in ((1, 1.3), (3, 20.0)):
         plane = RSPropagator(fine, point((0.0, r), 0.05), z, WAVELENGTH_UM, dtype=torch.complex128)
         # The pixelated circle of the plane path has an edge error of a few 1e-4.
         assert abs(complex(plane(aperture)) - complex(flat[index])) < 2e-3

@@ -151,9 +151,9 @@ def test_agrees_with_torchoptics():
 
 
 def test_asm_and_rs_agree_where_both_hold():
-    source = centred_grid((256, 256), 0.1)
+    source = centred_grid((160, 160), 0.1)
     spot = torch.exp(-((torch.from_numpy(np.hypot(source.y_um[:, None], source.x_um[None, :])) / 2) ** 2))
-    target = centred_grid((200, 300), 0.1, (2.0, 1.55))
+    target = centred_grid((120, 180), 0.1, (2.0, 1.55))
     arguments = (source, target, 10.0, WAVELENGTH_UM)
     rs = RSPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
     asm = ASMPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
@@ -170,7 +170,7 @@ def test_asm_and_rs_agree_on_a_rough_element():
         cells.repeat_interleave(4, 0).repeat_interleave(4, 1)[None], 5, 1, 2
     )
     wave = element_field(height[0].double(), source, Optics())
-    for distance in (2.0, 12.0, 75.0):
+    for distance in (2.0, 12.0, 40.0):
         arguments = (source, source, distance, WAVELENGTH_UM)
         rs, asm = (kind(*arguments, dtype=torch.complex128)(wave) for kind in (RSPropagator, ASMPropagator))
         assert (rs - asm).norm() < 0.01 * rs.norm()
@@ -231,7 +231,7 @@ def test_energy_is_kept_by_asm(pitch):
     grid = centred_grid((360, 360), pitch)
     u = gaussian(grid)
     power = float(u.abs().square().sum())
-    out = ASMPropagator(grid, grid, 50.0, WAVELENGTH_UM, dtype=torch.complex128)(u)
+    out = ASMPropagator(grid, grid, 25.0, WAVELENGTH_UM, dtype=torch.complex128)(u)
     assert float(out.abs().square().sum()) == pytest.approx(power, rel=1e-6)
 
 

@@ -23,7 +23,7 @@ from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Sheet
 from litho_models import load_frozen
 from tests.litho_models.loop_scans import search_little
 
-SIZE_PX, LAYOUTS = 128, 5
+SIZE_PX, LAYOUTS = 128, 4
 SMALL = {
     "layout.size_px": SIZE_PX,
     "optics.distance_um": 15,
