@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from multiprocessing import forkserver, get_context
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,15 +39,28 @@ from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 from tests.litho_models.prints import make_scans, write_store
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
+_START = "distributed.worker.multiprocessing-method"
 
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Start a cluster of two one-thread workers. A job that kills one worker is retried, but only once."""
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, scheduler_kwargs={"allowed_failures": 1}
-    ) as cluster:
+    """Start a cluster of two one-thread workers. A job that kills one worker is retried, but only once.
+
+    The workers are forked from a process that has imported what they need.
+    """
+    get_context("forkserver").set_forkserver_preload(["distributed", campaign.__name__])
+    forkserver.ensure_running()
+    with (
+        dask.config.set({_START: "forkserver"}),
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            dashboard_address=None,
+            scheduler_kwargs={"allowed_failures": 1},
+        ) as cluster,
+    ):
         yield cluster.scheduler_address
 
 
@@ -72,6 +86,7 @@ def test_a_worker_uses_freed_memory_again() -> None:
     MiB.
     """
     with (
+        dask.config.set({_START: "spawn"}),  # a forked process has the memory settings of its parent
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):

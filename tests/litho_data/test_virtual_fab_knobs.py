@@ -73,35 +73,46 @@ def scan(job: Job, *knobs: KnobSetting, noise: Noise | None = None):
     return scan_job(Fab(Printer(), Microscope.aligned(), noise or Noise.off(), KnobBoard(knobs, 4), 4), job)
 
 
+@pytest.fixture(scope="module")
+def plain(jobs):
+    """Return the scans of the jobs without a knob and without noise."""
+    return [scan(job) for job in jobs]
+
+
+@pytest.fixture(scope="module")
+def noisy(jobs):
+    """Return the noisy scan of the first job without a knob."""
+    return scan(jobs[0], noise=Noise())
+
+
 def test_every_effect_of_the_catalogue_has_a_knob_and_no_other_name_is_used():
     assert {knob.effect for knob in KNOBS.values()} == CATALOGUE | {"off-catalogue"}
 
 
 @pytest.mark.parametrize("name", KNOBS)
-def test_strength_zero_changes_no_bit(name, jobs):
-    plain, off = scan(jobs[0], noise=Noise()), scan(jobs[0], KnobSetting(name, 0.0, 3), noise=Noise())
-    assert np.array_equal(plain.height_um, off.height_um)
-    assert np.array_equal(plain.clean_um, off.clean_um)
+def test_strength_zero_changes_no_bit(name, jobs, noisy):
+    off = scan(jobs[0], KnobSetting(name, 0.0, 3), noise=Noise())
+    assert np.array_equal(noisy.height_um, off.height_um)
+    assert np.array_equal(noisy.clean_um, off.clean_um)
 
 
 @pytest.mark.parametrize("name", KNOBS)
-def test_more_strength_changes_more(name, jobs):
+def test_more_strength_changes_more(name, jobs, plain):
     knob = KNOBS[name]
-    noise = Noise(0, 0, 0, 0, 0)
-    plain = [scan(job, noise=noise).height_um for job in jobs]
     changes = []
     for share in (0.2, 0.5, 1.0):
         setting = KnobSetting(name, share * knob.limit, 5)
-        scans = [scan(job, setting, noise=noise).height_um for job in jobs]
-        changes.append(np.sqrt(np.mean([(z - p) ** 2 for z, p in zip(scans, plain, strict=True)])))
+        scans = [scan(job, setting) for job in jobs]
+        shifts = [one.height_um - other.height_um for one, other in zip(scans, plain, strict=True)]
+        changes.append(np.sqrt(np.mean(np.square(shifts))))
     assert 0 < changes[0] < changes[1] < changes[2]
     assert np.isfinite(changes[2])
 
 
 @pytest.mark.parametrize("name", [name for name, knob in KNOBS.items() if knob.stage == "measurement"])
-def test_measurement_never_touches_the_print(name, jobs):
+def test_measurement_never_touches_the_print(name, jobs, plain):
     turned = scan(jobs[0], KnobSetting(name, KNOBS[name].limit, 5))
-    assert np.array_equal(turned.clean_um, scan(jobs[0]).clean_um)
+    assert np.array_equal(turned.clean_um, plain[0].clean_um)
 
 
 def test_a_knob_does_not_change_the_random_draws_of_other_knobs(jobs):
