@@ -87,7 +87,7 @@ def gaussian_blur(
                 raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
             # For the blur along x, the lines of all samples are stacked into one image.
             images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
-            if _differentiated(sigma_px):
+            if _differentiated(field, sigma_px):
                 blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
             else:
                 # Without derivatives, the band matrix is cached. In a small field, keeping track of
@@ -209,12 +209,13 @@ def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
     return functional.pad(field, border) if before or after else field
 
 
-def _differentiated(number: Tensor) -> bool:
-    """Return True if operations are recorded for derivatives, or if ``number`` is wrapped by ``torch.func``
-    and therefore has no single value.
+def _differentiated(*numbers: Tensor) -> bool:
+    """Return True if operations on these numbers are recorded for derivatives, or if one of them is wrapped
+    by ``torch.func`` and therefore has no single value.
     """
+    recorded = torch.is_grad_enabled() and any(one.requires_grad for one in numbers)
     forward_mode = torch.autograd.forward_ad._current_level >= 0
-    return torch.is_grad_enabled() or forward_mode or is_functorch_wrapped_tensor(number)
+    return recorded or forward_mode or any(map(is_functorch_wrapped_tensor, numbers))
 
 
 @lru_cache(maxsize=32)

@@ -8,6 +8,14 @@ from importlib import import_module
 import pytest
 
 
+@pytest.fixture(scope="session", autouse=True)
+def few_like_pixels() -> Iterator[None]:
+    """Estimate noise floors from few pixels. Tests of the value of a floor set their own number."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("litho_models.scoring.like_layouts._PIXELS_PER_SCAN", 400)
+        yield
+
+
 @pytest.fixture
 def pageless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the pages of evaluations and benchmarks, which take longer than the rest of them."""

@@ -39,7 +39,7 @@ from litho_models.noise.variance import (
     place_maps,
     scale_nm,
 )
-from litho_models.scoring import like_layouts
+from litho_models.scoring import like_layouts, noise_floor
 from litho_models.scoring.like_layouts import like_pixels
 from litho_models.scoring.noise_floor import estimated_floor, floor_of_residuals, freed_by_policy
 from litho_models.scoring.statistics import bootstrap_interval
@@ -513,10 +513,11 @@ def test_the_floor_is_the_planted_noise_whatever_the_model_lacks(monkeypatch):
     assert found.at("none").rmse_nm == pytest.approx(np.hypot(bowed, 30 * np.sqrt(12 / 11)), rel=0.05)
 
 
-def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
+def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random, monkeypatch):
     """Check rare rough places whose partners are smooth. Half of the squared difference is too small for
     them.
     """
+    monkeypatch.setattr(like_layouts, "_PIXELS_PER_SCAN", 3000)
     scans = make_scans(4, size_px=96)
     rough_places = [scan.mask_level >= 9 for scan in scans]
     residuals = [
@@ -537,21 +538,25 @@ def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
         assert len({*row, mine}) == drawn.partners.shape[1] + 1
 
 
-@pytest.mark.parametrize("draw", ["normal", "laplace", "uniform"])
-def test_the_mean_absolute_noise_needs_no_gaussian(draw, random):
+def test_the_mean_absolute_noise_needs_no_gaussian(random, monkeypatch):
     """Check noise that is not Gaussian. A factor of √2 between differences and noise would be wrong by 6 %
     for it.
     """
+    monkeypatch.setattr(like_layouts, "_PIXELS_PER_SCAN", 3000)
     scans = make_scans(5, size_px=96, noise_um=0.0, datum_um=0.0)
-    noise = [1e-3 * getattr(random, draw)(-10 if draw == "uniform" else 0, 10, scan.shape) for scan in scans]
-    noisy = [
-        replace(scan, height_um=(scan.height_um + own).astype(np.float32))
-        for scan, own in zip(scans, noise, strict=True)
-    ]
-    found = floor(noisy, heights_um(scans), "offset")
-    # From 15,000 pixels with four partners each, the error is below 2 %.
-    assert found.mae_nm == pytest.approx(1e3 * np.mean(np.abs(noise)), rel=0.025)
-    assert found.rmse_nm == pytest.approx(1e3 * np.std(noise), rel=0.025)
+    # The similar pixels depend only on the layouts, so they are searched once.
+    similar = like_pixels(scans, [np.ones(scan.shape, bool) for scan in scans])
+    monkeypatch.setattr(noise_floor, "like_pixels", lambda *_: similar)
+    for draw, low in (("normal", 0), ("laplace", 0), ("uniform", -10)):
+        noise = [1e-3 * getattr(random, draw)(low, 10, scan.shape) for scan in scans]
+        noisy = [
+            replace(scan, height_um=(scan.height_um + own).astype(np.float32))
+            for scan, own in zip(scans, noise, strict=True)
+        ]
+        found = floor(noisy, heights_um(scans), "offset")
+        # From 15,000 pixels with four partners each, the error is below 2 %.
+        assert found.mae_nm == pytest.approx(1e3 * np.mean(np.abs(noise)), rel=0.025)
+        assert found.rmse_nm == pytest.approx(1e3 * np.std(noise), rel=0.025)
 
 
 def test_changes_by_a_dose_do_not_count_as_noise_of_similar_layouts(monkeypatch):
