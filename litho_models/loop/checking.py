@@ -1,9 +1,10 @@
 """Check whether an effect that was found is the true cause of a part of the residual. The check uses a model
 that also contains all other effects that were found.
 
-If the effect is the true cause, the residual no longer depends on the change that the effect makes to the
-prediction. If the effect only resembles the true cause, the residual contains variants of this change: the
-change scaled with height or position, blurred, displaced or squared.
+If the effect is the true cause, the residual of this model no longer depends on the change that the effect
+makes to the prediction. If the effect only resembles the true cause, the residual still contains variants of
+this change: the change multiplied by functions of height or position, or the change blurred, displaced or
+squared.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ class Check:
         state: the model, with all its effects.
         others: the causes and laws in the model; each of them is compared with the cause that is checked.
         laws, tables: all laws and tables that could replace a cause.
-        left_nm2: the part of the model's squared residual that can still be explained by features of layout
-            and position, nm².
+        left_nm2: mean square of the part of the model's residual that features of layout and position can
+            still explain, nm².
         secants: the changes that the laws and tables would make to the predictions.
     """
 
@@ -88,8 +89,8 @@ class Check:
 
         The gain of the other effect must be more than ten times the gain of this cause. If the other effect
         is a law, this is sufficient, because every law is approximate. If the other effect is a cause, there
-        is a second condition. It is tested in the model without this cause: variants of the other effect's
-        change must reduce the error by at least half of this cause's gain.
+        is a second condition: in the model without this cause, variants of the change that the other effect
+        makes must reduce the squared error by at least half of this cause's gain.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -102,8 +103,8 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Replace a cause, which has passed the checks of ``of``, by short laws. Reject the cause if the
-        model with the laws fits better.
+        """Test whether short laws could replace a cause that has passed the checks of ``of``. Reject the
+        cause if the model with the laws instead of the cause fits better.
 
         At most two laws are used. Together, they have no more parameters than the cause.
         """
@@ -119,8 +120,8 @@ class Check:
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Replace a cause, which has passed the checks of ``of``, by a table. Reject the cause if the table
-        explains more.
+        """Test whether a table could replace a cause that has passed the checks of ``of``. If it could,
+        reject the cause.
 
         The cause is rejected if two conditions hold: the gain of the table is more than twice the gain of the
         cause, and held-out scans do not confirm the cause when it is added to the model with this table.
@@ -138,8 +139,8 @@ class Check:
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
         """Return the law with the largest predicted gain among the laws with at most ``numbers`` parameters.
-        Return None if the predicted gain of each of them is much smaller than the gain of the cause that is
-        checked.
+        Return None if no predicted gain exceeds the fraction ``WORTH_FITTING`` of the gain of the cause that
+        is checked.
         """
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
@@ -153,8 +154,8 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """A cause changes the prediction. Add variants of this change to the model, and return the decrease of
-    the squared error on held-out scans, nm².
+    """Return by how much the squared error on held-out scans decreases, nm², if variants of the change that a
+    cause makes to the prediction are added to the model.
 
     Args:
         without: model without the cause.

@@ -55,7 +55,7 @@ class Closed:
             Tables act after all other effects of the printer and before the effects of the microscope.
         rest: function that returns the part of a model's residual that can still be explained by features of
             layout and position.
-        untestable: effects that the scans could not test, each with the reason.
+        untestable: effects that could not be tested with these scans, each with the reason.
     """
 
     base_name: str
@@ -75,8 +75,8 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the corrected scans. The measurement errors that the scans of a group have in common have
-        been subtracted from these scans.
+        """Return the corrected scans: the scans minus the measurement errors that all scans of a group
+        share.
         """
         return self.base.study
 
@@ -116,7 +116,7 @@ class Closed:
         return [*self.traced, *self.described.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Return whether the search has found the cause also with every other base model.
+        """Return whether the search with every other base model has also found the cause.
 
         Base models with more parameters than the chosen base model are ignored, because their parameters may
         have absorbed the cause.
@@ -177,9 +177,9 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 def with_answer(
     closed: Closed, cause: Cause | None, name: str, values: Mapping[str, float], **known: Any
 ) -> Closed:
-    """Update the result of a loop after later prints: replace a cause or law by the effect that is still
-    possible, and return the new result. Each model that contains the cause is fitted again with this effect
-    instead.
+    """Replace a cause or law in the result of a loop by the effect that is still possible after later prints,
+    and return the new result. Each model that contained the cause is fitted again with the effect instead of
+    the cause.
 
     Args:
         closed: the result.
@@ -229,8 +229,8 @@ def freed_scans(state: State) -> list[PrintedScan]:
     """Subtract from each scan the measurement errors that all scans of its group have in common. Return the
     corrected scans.
 
-    Errors that are common to all scans are not subtracted, so they can still be attributed to a cause. The
-    errors that are subtracted from a scan are learned from the scans outside its fold.
+    Errors that all scans of all groups share are not subtracted, so they can still be attributed to a cause.
+    The errors to subtract from a scan are learned from the scans outside its fold.
     """
     study = state.study
     maps, scans, freed = state.maps_um(study.scans), study.stored, study.stored
@@ -260,9 +260,9 @@ def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
     them is chosen.
 
-    For each base model, count the causes that the search found with this base model but not with all others.
-    The model with the fewest such causes is the simplest. If several models have the same number of such
-    causes, choose the model that has the fewest parameters together with its effects.
+    For each base model, count the causes that the search found with this base model but missed with at least
+    one other. The model with the fewest such causes is the simplest. If several models have the same number
+    of such causes, choose the model that has the fewest parameters together with its effects.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
@@ -278,8 +278,8 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
     """Search for laws that the model with the causes still lacks, and then for tables. Then check each cause
-    in a model that also contains the laws. If a table reduces the error more than all causes together, this
-    model also contains the table.
+    in a model that also contains the laws. This model contains a table, too, if the table reduces the error
+    more than all causes together.
 
     A cause that fails its check is removed, and the search for laws and tables is repeated without it. Return
     the result of the search for laws and the result of the search for tables.

@@ -136,10 +136,10 @@ class HeldOut:
         """Return the errors of three models of a loop: the base model, the base model with the causes, and
         the corrected model.
 
-        Each scan is predicted by a fit to the scans outside its fold. If the base is refitted and prints were
-        scanned several times, there is a second score of the base model and of the corrected model. For this
-        score, each scan is predicted by a fit that leaves out all scans of the same print. The base model
-        with the causes is listed only if it differs from both other models.
+        Each scan is predicted by a fit to the scans outside its fold. The base model with the causes is
+        listed only if it differs from both other models. If the base is refitted and prints were scanned
+        several times, the base model and the corrected model are scored a second time. In this second score,
+        each scan is predicted by a fit that leaves out all scans of the same print.
         """
         plain, causes = closed.plain, closed.named.state
         numbers = len(plain.twin.vector)
@@ -234,8 +234,8 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Return the errors of the base model and of the corrected model on scans that were used neither for
-    choosing nor for fitting these models.
+    """Return the errors of the base model and of the corrected model on scans that were used neither to
+    choose nor to fit these models.
 
     Args:
         found: for each loop, its ``HeldOut`` object, its result, and the scans that it did not use.

@@ -119,7 +119,9 @@ class Study:
 
     @cached_property
     def groups(self) -> dict[str, Labels]:
-        """Return the labels of all scans, keyed by the name of the grouping."""
+        """Return, for each grouping of the scans, the label of the group to which each scan belongs. The
+        result is keyed by the name of the grouping.
+        """
         return groupings(self.stored)
 
 
@@ -254,9 +256,9 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
 
     The better start is the one from which a fit to some of the scans reaches the smaller error.
 
-    The second start is tried for the following reason: if a base was fitted without an effect, its parameters
-    have absorbed part of this effect. When the effect is added, a fit from these parameters may therefore get
-    stuck in a local optimum.
+    When an effect is added to the model, the parameters of the base have already absorbed part of this
+    effect. A fit that starts from these parameters may get stuck in a local optimum. For this reason, the
+    second start is also tried.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):

@@ -1,10 +1,11 @@
 """Decide whether held-out scans confirm a change of the model. Each scan counts as one observation.
 
-Two conditions must hold. First, the change must have the right sign in most scans. In a scan that contains
-the effect, the inner product of the change of the prediction with the residual before the change is positive.
-A sign-flip test of these products checks this condition. Second, the change must reduce the error although
-its strength is the same in all scans (or in all scans of a group). The confidence interval of this reduction
-must lie above zero.
+There must be at least ``FEWEST_SCANS`` scans, and three conditions must hold. First, the change must have the
+right sign in most scans. In a scan that contains the effect, the inner product of the change of the
+prediction with the residual before the change is positive. A sign-flip test of these products checks this
+condition. Second, the change must reduce the squared error although its strength is the same in all scans (or
+in all scans of a group): the confidence interval of the reduction must lie above zero. Third, the reduction
+must be large enough to matter (see ``SMALLEST_SHARE``).
 """
 
 from __future__ import annotations
@@ -117,8 +118,8 @@ def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
     """Return whether another change of the model is clearly worse than the best change. Two conditions must
-    hold: a sign-flip test over the scans shows that the other change is worse, and its gain is at most three
-    quarters of the best gain.
+    hold: a sign-flip test over the scans shows that the other change is worse, and the gain of the other
+    change is at most three quarters of the best gain.
 
     Args:
         before_nm2, best_nm2, other_nm2: mean squared error of each scan before the change, after the best

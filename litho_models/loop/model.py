@@ -56,8 +56,8 @@ class FoldedBase(nn.Module):
 
 @dataclass(frozen=True)
 class Slot:
-    """The identity of one fitted parameter of an effect. ``label`` is the label of the group of scans to
-    which the parameter applies, or None if it applies to all scans.
+    """Identifies one fitted parameter of an effect. ``label`` is the label of the group of scans to which the
+    parameter applies, or None if the parameter applies to all scans.
     """
 
     effect: str
@@ -128,8 +128,8 @@ class Twin:
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """Return the slots of all fitted parameters of effects. They have the same order as in ``vector``,
-        where they follow the parameters of the base.
+        """Return one slot for each fitted parameter of an effect. The order is that of ``vector``, where the
+        parameters of the effects follow the parameters of the base.
         """
         return [
             Slot(name, key, label)
@@ -206,8 +206,8 @@ class Twin:
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
         """Replace the strengths that the given scans do not determine, and return the new twin. The strengths
         of the groups to which these scans belong are kept. The strengths of all other groups are replaced by
-        the means of the kept strengths. If no strength is kept, the null values are used, at which the effect
-        does nothing.
+        the means of the kept strengths. If no strength is kept, each strength is set to its null value, at
+        which the effect does nothing.
         """
         effects = {}
         for name, one in self.effects.items():

@@ -159,8 +159,8 @@ class PreparedScan:
 
 
 def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
-    """Prepare all scans of a store. Positions in the writing order are scaled so that these scans span -0.5
-    to 0.5.
+    """Prepare all scans of a store. Positions in the writing order are scaled so that they run from -0.5
+    (first of these scans) to 0.5 (last).
     """
     ranks = np.argsort(np.argsort([scan.order for scan in scans], kind="stable"), kind="stable")
     scaled = ranks / max(len(scans) - 1, 1) - 0.5 if len({s.order for s in scans}) > 1 else 0.0 * ranks
@@ -190,8 +190,8 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
     """Prepare further scans, in addition to the prepared scans ``known``. The position of each further scan
-    in the writing order is interpolated between the scaled positions of the known scans, so that all scans
-    have the same scale.
+    in the writing order is interpolated between the scaled positions of the known scans, so that the
+    positions of all scans have the same scale.
     """
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
     prepared = []
@@ -202,8 +202,8 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 
 def sample_border_px(size: int) -> int:
-    """Return the width of the border of a scan that is left out of fits, in pixels. The pixels in this border
-    have neighbours outside the layout. ``size`` is the length of the shorter axis of the scan.
+    """Return the width, in pixels, of the border that fits leave out of a scan. The prediction at these
+    pixels depends on surroundings outside the layout. ``size`` is the length of the shorter axis of the scan.
 
     Only fits leave out the border. Errors are scored on all pixels, as in the benchmark
     (``NuisanceProtocol.border_px``).

@@ -41,9 +41,9 @@ class ErrorRow(Record):
     Attributes:
         model: ``base`` for the base model, ``causes`` for the base model with the causes that were found, or
             ``all`` for the corrected model.
-        measurement: what was added to the predicted print. With ``print alone``, nothing was added. With
-            ``published``, the smooth background of the training scans was added (the published protocol).
-            With ``shared``, the whole measurement model was applied.
+        measurement: what was added to the predicted print before it was compared with the scan. With ``print
+            alone``, nothing was added. With ``published``, the smooth background of the training scans was
+            added (the published protocol). With ``shared``, the whole measurement model was applied.
         policy: name of the policy, which is a set of terms. These terms were fitted to each scan, using only
             pixels that are not scored.
         k: effective number of these terms.
@@ -167,7 +167,7 @@ class Candidate(Record):
 
 
 class ScanFinding(Record):
-    """The evidence of single scans for a per-scan term or for a mark, such as a scar. Such terms and marks
+    """The evidence for a per-scan term or for a mark (such as a scar) in single scans. Such terms and marks
     are not part of any model.
 
     Attributes:
@@ -203,11 +203,11 @@ class Planted(Record):
     copies.
 
     ``amount`` is the planted strength. ``rms_nm`` is the rms of the change that the planted effect makes,
-    after the free terms of each scan have been fitted to this change and subtracted. ``named`` lists the
-    cause that the loop found and the effects that look the same, if the planted effect is among them;
-    otherwise it is empty. A cause counts only if the search has also found it with every other base model,
-    except base models with more parameters. ``found`` is the fitted strength; it is None if the effect is not
-    in the model.
+    after the free terms of each scan have been fitted to this change and subtracted. If the planted effect is
+    a cause that the loop found, or looks the same as such a cause, ``named`` lists this cause and all effects
+    that look the same. Otherwise, ``named`` is empty. A cause counts only if the searches with all other base
+    models have also found it; base models with more parameters are ignored. ``found`` is the fitted strength
+    of the planted effect, or None if this effect is not in the corrected model.
     """
 
     name: str
@@ -234,9 +234,8 @@ class Comparison(Record):
     """A comparison, on new prints, of two possible answers to a question.
 
     ``better`` is the answer that fits better, and ``worse`` is the other answer. ``gain_nm2`` is the
-    difference of their squared errors. ``z`` is this difference in standard deviations, after an allowance
-    for inexact formulas of the model has been subtracted. ``difference_nm`` is the rms difference of the two
-    predictions.
+    difference of their squared errors. ``z`` is this difference minus an allowance for inexact formulas of
+    the model, in standard deviations. ``difference_nm`` is the rms difference of the two predictions.
     """
 
     better: str
@@ -247,7 +246,7 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """The answer to an open question, as far as new prints can decide it.
+    """What new prints have decided about an open question.
 
     ``declared`` lists the possible answers, which were stated before these prints were made, and ``left``
     lists the answers that are still possible. ``prints`` and ``scans`` are the numbers of new prints and of

@@ -101,8 +101,8 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 def _values(twin: Twin) -> dict[str, float]:
     """Return the fitted values of the parameters of the base model, keyed by name. Arrays of parameters are
-    left out. Where the physical unit of a value is known, the value is in this unit. The result is empty if
-    the base model was not fitted.
+    left out. A parameter with a range is converted from its raw number to the physical value (see
+    ``layers.ranges``). The result is empty if the base model was not fitted.
     """
     base, found = twin.fitted_base, {}
     if twin.own and isinstance(base, Simulator):
@@ -147,9 +147,9 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """Return the fitted values of the parameters of an effect, keyed by the name of the parameter. Their
-    confidence intervals are computed from the scatter over prints. The scatter over scans is used instead if
-    there are too few prints, or if the strength applies to only one print. If it applies to only one scan,
-    there is no interval.
+    confidence intervals are computed from the scatter over prints. If there are too few prints, or if a
+    strength applies to only one print, the scatter over scans is used instead. A strength that applies to
+    only one scan has no interval.
     """
     twin, scans = closed.final.twin, closed.study.scans
     kinds = [independent(scans), [scan.id for scan in scans]]
@@ -181,8 +181,8 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
-    """Return the name of the statistical unit to which each scan belongs. Confidence intervals treat these
-    units as independent. A unit is a print, or a single scan if there are too few prints.
+    """Return, for each scan, the print to which it belongs, or the scan itself if there are too few prints.
+    Confidence intervals treat the returned units as independent.
     """
     prints = [scan.stored.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]

@@ -84,13 +84,12 @@ def close_loop(
         seed: seed of the folds, the calibration blocks and the permutations.
         workers: number of local processes.
         dask: address of a Dask scheduler to use instead of local processes.
-        further: function that receives the closed loop and its findings about per-scan terms. It returns
-            three values: the loop to record, the decisions on open questions, and a list of further records.
-            The returned loop may differ from the one received.
+        further: function that receives the result of the loop and its findings about per-scan terms. It
+            returns three values: the result to record, which it may have changed; the decisions on open
+            questions; and a list of further records.
         decided_by: hashes of the further stores that the function ``further`` uses. They are recorded in the
             settings.
-        left_out: one text for each scan of the further stores that is not used, with the name of the scan and
-            the reason.
+        left_out: one text for each unused scan of the further stores: the name of the scan and the reason.
         report: function that receives the progress messages.
 
     Raises:

@@ -68,13 +68,12 @@ class Trial:
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray, axis: int | None = None) -> np.ndarray:
-        """Multiply each parameter set by its factor in ``multiples``, of shape (…, sets). Return whether
-        every amplitude then lies on the allowed side of its null value: one result per row of ``multiples``
-        if ``axis`` is -1, and otherwise one result for all rows.
+        """Return whether every amplitude lies on the allowed side of its null value after each parameter set
+        has been multiplied by its factor in ``multiples``, of shape (…, sets). If ``axis`` is -1, there is
+        one result per row of ``multiples``; otherwise, there is a single result for all rows.
 
-        If an amplitude on the wrong side is small relative to the largest amplitude, it is attributed to
-        noise and ignored. The largest amplitude is taken over all rows, or over a single row if ``axis`` is
-        -1.
+        An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude:
+        the largest of its row if ``axis`` is -1, and otherwise the largest of all rows.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -188,11 +187,11 @@ class Screened:
             the model's own parameters can make have been projected out. If the trial has several columns,
             this is the largest of their fractions.
         beside_base: the same fraction after only the scan terms have been projected out.
-        family_p: p value of the candidate. The signs of the gains of the scans are flipped many times. The p
-            value is the fraction of these flips in which the gain of at least one candidate reaches the gain
-            of this one.
-        group_p: p value of the grouping. The scans are permuted at random. The p value is the fraction of
-            these permutations in which the gain with at least one grouping reaches the gain with this one.
+        family_p: p value of the candidate. The signs of the scans' gains are flipped in many ways. The p
+            value is the fraction of these ways in which at least one candidate reaches the gain of this
+            candidate.
+        group_p: p value of the grouping. The scans are permuted at random. The p value is the fraction of the
+            permutations in which the gain with at least one grouping reaches the gain with this grouping.
             None if no grouping was tested.
     """
 
@@ -300,8 +299,8 @@ class Screening:
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
-        """Return the significant candidates, in order of decreasing gain. For each candidate, the best
-        grouping is given, or ``all`` if no grouping of its strength is significant.
+        """Return the significant candidates, in order of decreasing gain. Each candidate has its best
+        grouping, or ``all`` if its strength does not differ significantly between groups.
         """
         standing = []
         for own in self.candidates.values():
@@ -315,8 +314,8 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Return the candidate with the best grouping of the scans. Return None if no grouping increases the
-        gain significantly compared with a strength that is the same in all scans.
+        """Return the candidate with its best grouping of the scans. Return None if no grouping gives a
+        significantly larger gain than a strength that is the same in all scans.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         options = {
@@ -381,9 +380,9 @@ class Screening:
 
         Args:
             options: gain in nm² and number of parameters of each grouping, keyed by the name of the grouping.
-            gains_of: function ``gains_of(by, moved)``. It takes the candidate for the grouping ``by`` and
-                lets its strengths differ by each of the groupings ``moved`` instead. It returns the gains,
-                nm², of shape (groupings, scans).
+            gains_of: function ``gains_of(by, moved)`` that returns gains for the permutation test, nm², of
+                shape (groupings, scans). In each row, the strengths of the candidate that was found for the
+                grouping ``by`` differ by one of the permuted groupings ``moved`` instead.
 
         Returns:
             The name of the chosen grouping, and its p value. The p value is the fraction of random

@@ -121,7 +121,7 @@ def search(
 def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Return the tables that, according to held-out scans, would improve a model. Each table is judged alone,
+    """Return the tables that held-out scans confirm as an improvement of a model. Each table is judged alone,
     by a linear fit, and is not added to the model. At most ``most`` tables are judged.
     """
     found: list[Cause] = []
@@ -291,7 +291,7 @@ def _test_again(found: Found) -> None:
 
 
 def untestable(study: Study) -> dict[str, str]:
-    """Return the effects that these scans cannot test, each with the reason."""
+    """Return the effects that cannot be tested with these scans, each with the reason."""
     reasons = {}
     one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
     for effect in CATALOGUE.values():

@@ -51,8 +51,8 @@ class SingleScans:
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
-        """Test all per-scan effects, one after the other, and return the findings. When an effect is tested,
-        the terms of all effects that were found before it are fitted, too. Line offsets are tested last.
+        """Test all per-scan effects, one after the other, and return the findings. In each test, the terms of
+        all effects that were found in earlier tests are fitted, too. Line offsets are tested last.
         """
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
@@ -198,8 +198,8 @@ def coefficients(
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
     """Judge a per-scan term by whether the two halves of each scan agree on it.
 
-    Counting the scans with a smaller error would not be a suitable test, because the error of a scan does not
-    decrease if its term is near zero.
+    The number of scans with a smaller error would not be a suitable test: in a scan whose term is near zero,
+    the error does not decrease even if the term differs from scan to scan.
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
