@@ -43,8 +43,8 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     of the squared errors is the squared distance between the two predictions. The actual difference varies
     about this value for two reasons. One reason is the noise, projected onto the difference of the
     predictions. The other reason is that the squared distance varies between prints, with the relative spread
-    ``question.spread``. An error of ``form_nm`` in the formulas of the model may explain a part of the
-    difference. This part is subtracted, as in the decision itself.
+    ``question.spread``. A part of the difference may come from inexact formulas of the model, whose error is
+    at most ``question.form_nm``. This part is subtracted, as in the decision itself.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -59,7 +59,7 @@ def of_repeats(prints: int, scans: int) -> float:
 
     The test is the F test of an analysis of variance. The term is attributed to the printer if the scans of
     one print agree better than expected by chance (p <= 0.005). It is attributed to the microscope if these
-    scans agree less well than expected for an effect of the printer (p <= 0.005). The two
+    scans agree less well than they would for a term that the printer causes (p <= 0.005). The two
     attributions have different powers, and the smaller power is returned.
     """
     if prints < 2 or scans < 2:
@@ -95,18 +95,17 @@ def prints_needed(powers: Sequence[float]) -> int | None:
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
     """Reduce a gain (difference of two squared errors) by an allowance for the error of the model itself.
-    Return the rest in standard deviations of the noise. The result is 0 if the gain does not exceed the
-    allowance.
+    Return the reduced gain in units of ``sd``. The result is 0 if the gain does not exceed the allowance.
 
-    Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose that
-    A is true except for noise n and an error e in the formulas of the model, which both rivals share. Prints
-    then show y = A + e + n, and the difference of the two squared errors is
-    |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise averages out over prints, but e recurs in every
-    print of similar texture. The angle between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy and
-    Schwarz), a difference of up to 2 |D| |e| is inconclusive, and no number of prints separates rivals with
-    |D| below 2 |e|. A second allowance is derived from the new prints. Without e and without noise, the gain
-    would be |D|². If the gain is smaller, the part of the shortfall that noise does not explain also counts
-    as an error of the model. The larger of the two allowances is used.
+    Let A and B be the predictions of two refitted rivals after projection onto the complement of the per-scan
+    terms, and D = B - A. Suppose that A is true except for noise n and an error e in the formulas of the
+    model, which both rivals share. Prints then show y = A + e + n, and the difference of the two squared
+    errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise averages out over prints, but e recurs
+    in every print of similar texture. The angle between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy
+    and Schwarz), a difference of up to 2 |D| |e| is inconclusive, and no number of prints separates rivals
+    with |D| below 2 |e|. A second allowance is derived from the new prints. Without e and without noise, the
+    gain would be |D|². If the gain is smaller, the part of the shortfall that noise does not explain also
+    counts as an error of the model. The larger of the two allowances is used.
 
     Args:
         gain: |y - B|² - |y - A|², where A is the rival that fits better.
@@ -144,8 +143,8 @@ def of_rivals(
 
     Args:
         rivalry: the rivals of the question.
-        tried: results for the ways to print and scan that were tried, keyed by a description of the way. Each
-            result is the separation of the two most similar rivals, in standard deviations.
+        tried: separation of the two most similar rivals, in standard deviations, for each tried way to print
+            and scan, keyed by a description of the way.
         planned: planned prints on which the rivals are compared.
         random: the same prints with random layouts.
         prints: number of prints in the plan.

@@ -81,8 +81,8 @@ class Limits:
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
         """Derive the limits from earlier prints. Very rare levels at both ends are excluded: the levels below
         the lowest allowed level together cover less than a thousandth of the area of these prints, and so do
-        the levels above the highest allowed level. Structures must not be finer than the structures in these
-        prints.
+        the levels above the highest allowed level. The highest spatial frequency is that of the finest
+        structures in these prints.
 
         Raises:
             InputError: every earlier layout has only one level, or nearly the whole area of these layouts has
@@ -235,12 +235,12 @@ def as_tensor(level: np.ndarray) -> Tensor:
 
 
 class Chosen(NamedTuple):
-    """The ways to make and scan prints that were chosen to decide one question, or all questions.
+    """The choice of how to make and scan prints, for one question or for all questions.
 
     ``ways`` lists the ways in which each print is scanned, one per scan. Successive prints cycle through
     ``places``, the positions in the write field, and through ``doses``, the relative doses. ``tried``
-    contains the results of the experiments that were tried, keyed by a description of the experiment. Each
-    result is the separation of the two most similar rivals, in standard deviations.
+    contains the separation of the two most similar rivals, in standard deviations, in each experiment that
+    was tried, keyed by a description of the experiment.
     """
 
     ways: tuple[Way, ...]
@@ -304,8 +304,8 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> list[np.ndarray]:
-    """Optimise ``count`` tiles. The questions take turns: each tile is optimised for the next question.
-    Return the soft (not rounded) levels of each tile.
+    """Optimise ``count`` tiles. Each tile is optimised for one question. Successive tiles cycle through the
+    questions. Return the soft (not rounded) levels of each tile.
 
     Args:
         rivalries: the rivals of each question.
@@ -340,8 +340,7 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return the self-similarity of a layout, i.e. how well it matches shifted copies of itself, as
-    registration measures it.
+    """Return how well a layout matches shifted copies of itself, as the registration would measure it.
 
     If the value is 1, the layout matches a shifted copy of itself perfectly, and registration cannot
     determine the shift.

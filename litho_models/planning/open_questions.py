@@ -97,7 +97,7 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 
 
 class _Asking:
-    """Make those open questions of a closed loop that have rivals."""
+    """Make the open questions of a closed loop whose answers are fitted models (rivals)."""
 
     def __init__(self, closed: Closed):
         self.closed, self.study = closed, closed.study
@@ -129,8 +129,9 @@ class _Asking:
 
     def of_suspects(self) -> Question | None:
         """Return the question of which unconfirmed effect, if any, explains the residual. An effect is
-        unconfirmed if it is significant in screening and held-out scans did not confirm it. Return None if
-        there is no such question.
+        unconfirmed if it is significant in screening and held-out scans did not confirm it. Return None if no
+        effect is unconfirmed. Also return None if only one effect is unconfirmed and the catalogue states
+        whether the printer or the microscope causes it.
         """
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
@@ -210,8 +211,8 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
     or the microscope is the source, the list contains both. Otherwise, it contains only None, which stands
     for the source that the catalogue states.
 
-    For an asymmetric tip, the source is also unknown. The reason is that a tip that is blunter along one axis
-    and a print that has wider flanks along this axis give similar scans.
+    The source is also unknown for an asymmetric tip, because a tip that is blunter along one axis and a print
+    whose flanks are wider along this axis give similar scans.
     """
     uneven = name == TIP and values["along"] != values["across"]
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]

@@ -4,8 +4,8 @@ planned.
 The possible answers to a question are called rivals (competing explanations). The fits of all rivals start
 from the same values of the base parameters, because the fit of the base model has more than one optimum. For
 example, one optimum may have an almost linear relation between dose and height, and another optimum a steep
-one. If the fits of two equivalent effects ended in different optima, the squared difference of their
-predictions on new layouts could be several nm² for this reason alone.
+one. If the fits of two equivalent effects ended in different optima, their predictions on new layouts could
+differ by several nm² (mean square) for this reason alone.
 """
 
 from __future__ import annotations
@@ -155,8 +155,8 @@ class Question(Record):
         spread: relative standard deviation, over scans, of the evidence for the effect, i.e. of the decrease
             of the squared error. The part that noise causes is not included.
         form_nm: upper bound, nm, on the rms error that inexact formulas of the model cause; None if it is
-            unknown. It is derived from the part of the residual that could still be learned. This is the
-            residual of a model that assumes one of the answers.
+            unknown. It is derived from the residual of a model that assumes one of the answers, namely from
+            the part of this residual that could still be learned.
         sizes: standard deviations of the parameters of a per-scan term over scans, keyed by the name of the
             parameter.
     """
@@ -198,9 +198,9 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Fit each model twice. The first fit starts from the current parameter values of the model. The second
-    fit starts from the result of the first, with the base parameters of the model that fitted best. For each
-    model, keep the better of the two fits.
+    """Fit each model twice. The first fit starts from the current parameter values of the model. In the
+    second fit, the base parameters start from those of the model that fitted best, and the other parameters
+    start from the result of the first fit. For each model, keep the better of the two fits.
     """
 
     def fitted(twin: Twin) -> LeastSquaresFit:

@@ -37,10 +37,10 @@ class PlannedScan(Record):
 class PlannedPair(Record):
     """The predicted comparison of two rivals (competing explanations) on the planned prints.
 
-    ``difference_nm`` is the rms difference that remains between the predictions of the two rivals after one
-    rival is refitted to the other. ``noise_nm`` is the standard deviation per pixel of the noise after
-    projection onto this difference. ``power`` lists the probabilities of a right decision with 1, 2, 3, …
-    prints.
+    ``difference_nm`` is the rms difference between the predictions of the two rivals after one rival has been
+    refitted to the prediction of the other. ``noise_nm`` is the standard deviation per pixel of the noise
+    after projection onto this difference. ``power`` lists the probabilities of a right decision with 1, 2, 3,
+    … prints.
     """
 
     rivals: tuple[str, str]

@@ -186,8 +186,8 @@ class Rivalry:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Return all ordered pairs of rivals, as indices: first the model that is assumed to be true, then
-        the model that is refitted to it.
+        """Return all ordered pairs of rivals. The first index of a pair is the model that is assumed to be
+        true, and the second is the model that is refitted to its prediction.
         """
         return list(permutations(range(len(self.twins)), 2))
 
@@ -322,8 +322,8 @@ def _chain(twin: Twin) -> EffectChain:
 
 
 def _inner(field: Tensor) -> Tensor:
-    """Cut off the edge of a field. There, a model lacks part of the surroundings that it needs for its
-    prediction.
+    """Crop the border of a field, where the prediction depends on surroundings that are not part of the
+    field.
     """
     border = sample_border_px(min(field.shape))
     return field[border:-border, border:-border]

@@ -6,8 +6,8 @@ model itself is subtracted from this difference, and the result is divided by it
 standard deviation is estimated from the scatter over blocks of pixels and, as in the plan, from the spread
 between prints. All scans of a print show the same roughness, so corresponding blocks of these scans are added
 before the scatter is computed. A rival is excluded if another rival fits better with p <= 0.005 and the
-difference is at least 1 % of the squared error of the better rival. If only one rival remains, it is the
-answer.
+difference is at least 1 % of the squared error of the better rival. The model without the effect in question
+is compared in the same way. If it is excluded and only one rival remains, this rival is the answer.
 """
 
 from __future__ import annotations
@@ -231,8 +231,8 @@ class Judge:
 def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Decision]) -> Closed:
     """Return the result of the loop with the causes that remain possible after the decisions. If new prints
     exclude a cause, it is replaced by an effect that remains possible. If only one answer remains, its effect
-    is named as the cause, and the role of this effect becomes ``process`` if the printer causes it and
-    ``measurement`` if the microscope causes it.
+    is named as the cause. The role of this effect is ``process`` if the answer states that the printer causes
+    it, ``measurement`` if the answer states the microscope, and otherwise the role in the catalogue.
     """
     questions = {one.name: one for one in open_.questions}
     for decision in decisions:
