@@ -107,8 +107,8 @@ def judge_board(
     """Give every store of a board to a loop, judge the answers of the loop, and write ``scoreboard.json`` and
     ``scoreboard.csv``.
 
-    If the loop raises an error, only the current trial counts as failed, and the next trial is run. If the
-    call is interrupted, repeat it to resume the work.
+    If the loop raises an error, the current trial counts as failed, and the board continues with the next
+    trial. If the call is interrupted, repeat it to resume the work.
 
     Args:
         board: folder written by ``new_board``.

@@ -1,5 +1,6 @@
 """Choose at random which causes of error the virtual fab adds to the prints and scans of each trial of a
-board. The causes are the forms in ``other_forms`` and most knobs of the virtual fab.
+board. The causes are most knobs (settings of the virtual fab) and the forms in ``other_forms`` (laws that the
+loop's catalogue does not contain).
 
 One seed determines all draws. They are made before the loop runs on any trial.
 
@@ -66,10 +67,10 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
     """Choose at random the causes of each trial of a board. The trials are in random order, and each has its
     own printer parameters.
 
-    Each knob (setting of the virtual fab) and each form (law that the loop's catalogue does not contain) is
-    used once before any of them is used again. On the board ``singles``, a trial with a knob is of kind
-    ``alias`` or ``in-form``. It is of kind ``alias`` if the base model can imitate the effect of the knob, or
-    if the per-scan terms can absorb it. The sizes of the causes are drawn log-uniformly.
+    Knobs and forms are drawn at random without replacement. When all of them have been drawn, the drawing
+    starts again. On the board ``singles``, a trial with a knob is of kind ``alias`` if the base model can
+    imitate the effect of the knob or the per-scan terms can absorb it, and otherwise of kind ``in-form``. The
+    sizes of the causes are drawn log-uniformly.
 
     Raises:
         InputError: the seed is negative.

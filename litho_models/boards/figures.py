@@ -76,7 +76,7 @@ def counted(trials: Iterable[Trial]) -> list[Outcome]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """Compute the headline results. In a failed trial, no cause counts as found, and the error of the
+    """Compute the headline results. If a trial failed, its causes count as not found, and the error of its
     corrected model counts as too large.
     """
     trials = scoreboard.trials

@@ -32,9 +32,8 @@ _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Return all findings except findings about per-scan terms of the loop's catalogue, such as datum, bow or
-    line offsets. These are left out because the default noise of the virtual fab adds such terms to every
-    scan.
+    """Return all findings except those about per-scan terms of the loop's catalogue, such as datum, bow or
+    line offsets. The default noise of the virtual fab adds such terms to every scan.
     """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
@@ -139,8 +138,8 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Return whether the loop found that the scans of each group have a displacement along x in common. The
-    groups must be right: no group may contain both strongly and weakly displaced scans.
+    """Return whether the loop found a displacement along x that the scans of each group share. The finding
+    counts only if no group contains both strongly and weakly displaced scans.
     """
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
@@ -171,7 +170,7 @@ _UNFORESEEABLE = {
 def true_floor(
     draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
-    """Return the mean absolute error, nm, that remains if the true causes are known exactly. One term (the
+    """Return the mean absolute error, nm, of a model that contains the true causes exactly. One term (the
     datum) is fitted to each scan.
 
     The predictions are noise-free scans that contain all planted causes. Each predicted scan is mapped onto

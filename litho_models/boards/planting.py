@@ -1,9 +1,9 @@
 """Find the strengths of the causes of a trial, and simulate its prints and scans with these causes.
 
-The size of a cause is the rms of the residual that remains after the base model is refitted to prints with
-this cause. To measure this size, the Physics model is fitted to noise-free scans that contain the cause.
-(Without causes, the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine
-registration error are fitted to each scan at the same time.
+The size of a cause is the rms residual after the base model has been refitted to prints with this cause. To
+measure this size, the Physics model is fitted to noise-free scans that contain the cause. (Without causes,
+the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine registration error
+are fitted to each scan at the same time.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strength of each drawn cause from its drawn size. To measure the size, plant only this cause
-    in the given fields.
+    """Find the strength at which each drawn cause has its drawn size. The size is measured in the given
+    fields, in which only this cause is planted.
 
     If the draw has a form that changes the printer (``base``), this form comes first in the result.
 

@@ -32,9 +32,9 @@ class CauseDraw(Record):
     The size is defined as in `Planted.rms_nm`. Trials of kind ``alias`` are an exception; see `plant`.
 
     Attributes:
-        by: how the strength varies. With ``all``, it is the same in all scans. Otherwise, it is multiplied by
-            ``weak`` in some scans. With ``batch``, these are the scans after ``place`` in the printing order.
-            With ``field``, these are the scans with an id that does not end in a digit of ``place``.
+        by: how the strength varies. With ``all``, it is the same in all scans. With ``batch``, it is
+            multiplied by ``weak`` in all scans after ``place`` in the printing order. With ``field``, it is
+            multiplied by ``weak`` in all scans whose id does not end in one of the digits of ``place``.
     """
 
     name: str
@@ -158,8 +158,8 @@ class Answer(Result):
         found: causes, laws and descriptions.
         left: whether the residual has structure that the loop cannot explain.
         absorbed: names of effects that the loop cannot detect, because its base model can absorb them.
-        displaced_by: names of groupings (as in `Found.by`) for which the loop found that the scans of each
-            group have a displacement along x in common.
+        displaced_by: names of groupings (as in `Found.by`). The loop found that the scans of each group of
+            such a grouping share a displacement along x.
         before_nm, after_nm: mean absolute error of the model without and with the findings, over the scans
             that are not locked. Each scan is predicted by a model that was fitted to other scans, and one
             offset is fitted to the scan before the error is computed. None if the loop does not state the
@@ -187,8 +187,8 @@ class Trial(Result, extra="ignore"):
     failed.
 
     Attributes:
-        false_names: the wrong findings, i.e. those that are the right answer for none of the planted causes.
-            Each is given by the names of its effects.
+        false_names: the findings that name a cause but are the right answer for none of the planted causes.
+            Each finding is given by the names of its effects.
         bias: median relative error of the base model's values, without and with the findings; None if the
             printer or the base model is not a Physics model.
         dataset_cpu_s: CPU time that the loop used, s. In the published boards, it includes the time to build
