@@ -24,8 +24,8 @@ _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Return the spot size (standard deviation, µm) from which a model derives its default lengths, given the
-    pixel pitch of the layouts.
+    """Return the spot size (standard deviation, µm) from which a model derives its default lengths. It
+    depends on the pixel pitch of the layouts.
 
     The result is ``FIRST_SPOT_UM`` if this length is between half a pixel and ten pixels. Otherwise, the
     layouts are assumed to belong to another printer with a spot of two pixels.
@@ -35,9 +35,9 @@ def spot_um(pitch_um: float) -> float:
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """Return the values of a model's length settings (such as blur widths), scaled to the spot size for the
-    given pitch. For a length in ``set_``, the value in ``set_`` is scaled; for any other length, the default
-    value is scaled. If the scale is 1, the returned dict is empty.
+    """Scale the length settings of a model (such as blur widths) to the spot size for the given pitch, and
+    return the scaled values. A length that ``set_`` contains is scaled from its value there, and any other
+    length from its default. If the scale is 1, the returned dict is empty.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
@@ -102,8 +102,8 @@ class Simulator(nn.Module, ABC):
     of shape (batch, 1, ny, nx), in µm.
 
     A subclass implements ``interior``. The height of a pixel may depend only on the layout within
-    ``reach_px`` pixels of it. If a part of the layout is cut out with a margin of this width, the model
-    therefore predicts the same heights for this part as in the whole layout.
+    ``reach_px`` pixels of it. The heights of a part of the layout can therefore be predicted from this part
+    with a margin of ``reach_px``; they are the same as in a prediction of the whole layout.
     """
 
     name: ClassVar[str]
@@ -157,8 +157,8 @@ class Simulator(nn.Module, ABC):
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
         """Return the same height as ``forward``, µm, but with ``border_px`` pixels cropped on each side.
 
-        A model without a receptive radius overrides this method if it can skip the computation of the border.
-        For models with a receptive radius, ``predict_inside`` computes only the pixels that are needed.
+        A model without a receptive radius may override this method to skip the computation of the border. For
+        models with a receptive radius, ``predict_inside`` computes only the pixels that are needed.
         """
         return crop_border(self(layout_um), border_px)
 

@@ -43,8 +43,8 @@ class _WithSlopes(torch.autograd.Function):
     """An operation that computes the values of a function and their slopes, i.e. their derivatives with
     respect to the features. Only the slopes are kept for the backward pass.
 
-    The slopes take as much memory as the features, but the backward pass need not evaluate the function
-    again.
+    The slopes take as much memory as the features. With them, the backward pass need not evaluate the
+    function again.
     """
 
     @staticmethod

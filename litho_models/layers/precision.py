@@ -26,8 +26,8 @@ def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
 
 
 def warn_where_slower(precision: Precision, device_type: str) -> None:
-    """If this processor only emulates the given precision, print a warning on stderr that float32 is faster.
-    The warning is printed once per process.
+    """Warn on stderr that float32 is faster if this processor only emulates the given precision. The warning
+    is printed at most once per process.
     """
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
         _say("networks run in bfloat16, but this processor has no bfloat16 unit: float32 is faster")

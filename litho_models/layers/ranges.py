@@ -1,10 +1,9 @@
 """Ranges of fitted values, and the rule that decides whether a value counts as lying on a bound of its range.
 
-A fit does not change a value directly. The fit changes a raw number, and a formula converts this number to a
-value inside the range. Near a bound, the value hardly changes with the raw number, so a fit that came very
-close to the bound could not leave it again. Fits therefore keep the raw number above -``FLAT_FROM`` and, if
-the range has an upper bound, below ``FLAT_FROM``. A value whose raw number has reached such a limit counts as
-lying on the bound.
+A fit does not change a value directly. It changes a raw number, which a formula converts to a value inside
+the range. Very close to a bound, the value hardly changes with the raw number, so a fit could not leave the
+bound again. Fits therefore keep the raw number above -``FLAT_FROM`` and, if the range has an upper bound,
+below ``FLAT_FROM``. A value whose raw number has reached such a limit counts as lying on the bound.
 """
 
 import math

@@ -65,9 +65,9 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
 
 
 def registered_sources(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return hashes of the code outside this package on which a model depends: the code of a registered model
-    class, and the code of those registered parts that ``settings`` names. The dict is empty if the model and
-    all of its parts belong to this package.
+    """If a model uses code outside this package, return hashes of this code. It is the code of the model's
+    class, if the class was registered, and of those registered parts that ``settings`` names. Otherwise, the
+    returned dict is empty.
     """
     modular = issubclass(model_class(name), Printer)
     named = settings["parts"] if modular else [settings.get("illumination")]
@@ -89,7 +89,7 @@ def model_class(name: str) -> type[Simulator]:
 
 
 def require_models(names: Sequence[str]) -> None:
-    """Check a list of model names that a user gave, and raise an error if it is not valid.
+    """Check a list of model names that a user gave. If the list is not valid, raise an error.
 
     Raises:
         InputError: the list is empty or is a single string, or a name is repeated or unknown.
@@ -148,8 +148,8 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
 
 
 def _require_heights(model: Simulator) -> None:
-    """Predict the print of a ramp that rises from level 0 to the highest level. Raise an InputError that
-    names the model if the prediction fails or is not a finite height for each pixel.
+    """Predict the print of a ramp that rises from level 0 to the highest level. If the prediction fails or is
+    not a finite height for each pixel, raise an InputError that names the model.
     """
     side = model.tile.size_px if model.tile else _TRIAL_PX
     ramp = torch.linspace(0, model.config.full_height_um, side * side).reshape(1, 1, side, side)

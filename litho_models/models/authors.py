@@ -1,5 +1,6 @@
-"""Load weights that were trained with the code of the paper's authors, and use them in the models of variant
-``authors``. Each weight is renamed from its name in the authors' code to its name in this package.
+"""Load weights that were trained with the published code of the authors of Neural Lithography
+(arXiv:2309.17343), and use them in the models of variant ``authors``. Each weight has a name in the authors'
+code and is renamed to its name in this package.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """

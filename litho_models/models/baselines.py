@@ -1,6 +1,6 @@
-"""Baselines: simple models that every other model should surpass. The simplest baseline is the unchanged
-layout. The largest baseline is a weighted sum of features of the layout. In the formulas, M is the layout and
-H the printed height.
+"""Baselines: simple models, which every other model should surpass. The simplest baseline returns the
+unchanged layout. The most complex baseline is a weighted sum of features of the layout. In the formulas, M is
+the layout and H the printed height.
 """
 
 import torch
@@ -55,9 +55,9 @@ class BlurTableConfig(SimulatorConfig):
 
 
 class BlurTable(Simulator):
-    """A blur followed by a fitted table: H = T(G_σ * M), where G_σ is a Gaussian and * a convolution. T
-    interpolates linearly between fitted heights at evenly spaced inputs. The table has as many entries as the
-    layout has levels, but at most 33.
+    """A blur followed by a fitted table: H = T(G_σ * M), where G_σ is a Gaussian and * a convolution. T is a
+    table of fitted heights at evenly spaced inputs, with linear interpolation between them. The table has as
+    many entries as the layout has levels, but at most 33.
     """
 
     name = "blur-table"

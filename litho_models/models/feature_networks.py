@@ -1,9 +1,9 @@
-"""Networks that compute a part of the height of each pixel from features of this pixel. The features have no
-parameters. They describe either the layout around the pixel or the printed height along x.
+"""Networks that compute a contribution to the height of each pixel. Their inputs are features without
+parameters, which describe either the layout around the pixel or the printed height along x.
 
-Because the features do not change during a fit, they are computed only once, and the networks are fitted to
-single pixels (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes
-minutes.
+The features do not change during a fit, so they are computed only once, and the networks are fitted to single
+pixels (``litho_models.fitting.pixels``) instead of crops. A fit to pixels takes seconds, and a training on
+crops takes minutes.
 """
 
 from abc import abstractmethod

@@ -85,8 +85,8 @@ class OfField(nn.Module, ABC):
 
     def standardise(self, seen: Sequence[Tensor]) -> None:
         """Set the centre and the scale with which the inputs are standardised. ``seen`` contains one tensor
-        for each scan: the inputs at n pixels of the scan, with shape (inputs, n). The centre is the mean over
-        all scans, and the scale is the standard deviation within a scan.
+        for each scan: the inputs at n pixels of the scan, with shape (inputs, n). The centre of an input is
+        its mean over all scans, and the scale is its standard deviation within a scan.
         """
         centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
         spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
@@ -141,7 +141,7 @@ class Features(OfField, Simulator):
 
     def completed(self, features: Tensor) -> Tensor:
         """Return the features φ(M), followed by the features that a subclass computes from them. ``features``
-        contains φ(M) at n pixels. The result has one row for each weight and therefore shape (weights, n).
+        contains φ(M) at n pixels. The result has shape (weights, n), with one row per weight of the model.
         """
         return features
 
@@ -233,9 +233,8 @@ class RandomFeaturesConfig(FeaturesConfig):
 
 
 class RandomFeatures(Features):
-    """The model ``Features`` with additional features tanh(V z + c). The vector z contains the standardised
-    simple features, which are the first list that ``features`` returns. V and c are random and are not
-    fitted.
+    """The model ``Features`` with additional features tanh(V z + c). The vector z contains the simple
+    features (the first list that ``features`` returns), standardised. V and c are random and are not fitted.
 
     The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). Each
     random feature depends on ``inputs`` simple features, whereas each product in ``Features`` depends on only
@@ -265,8 +264,8 @@ class RandomFeatures(Features):
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """For each pixel that is at least ``step`` pixels from the edge, return the values ``step`` pixels above,
-    below, left and right of the pixel, as four fields.
+    """Return four fields. They contain, for each pixel that is at least ``step`` pixels from the edge, the
+    values ``step`` pixels above, below, left and right of this pixel.
     """
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

@@ -1,5 +1,5 @@
-"""FNO: the Fourier neural operator. In the paper, the FNO is the simulator that is learned from data alone,
-without knowledge of physics.
+"""FNO: the Fourier neural operator. Of the simulators in the paper (arXiv:2309.17343), the FNO is the one
+without built-in physics; it is learned from data alone.
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
 24; see arXiv:2309.17343, appendix "Fourier Neural Operator". The output of each layer is the sum of two
@@ -178,8 +178,8 @@ class SpectralConvolution(nn.Module):
         """Convolve a field of shape (batch, ny, nx, channels). If the field has fewer frequencies than the
         convolution has modes, only the lowest modes are used.
 
-        Only a few frequencies are kept. Multiplying by the waves of these frequencies is therefore cheaper
-        than a fast Fourier transform.
+        The transform is a multiplication by the waves of the few frequencies that are kept, which is cheaper
+        than a fast Fourier transform of the field.
         """
         ny, nx = field.shape[1:3]
         modes_y, modes_x = self.weight.shape[3:5]

@@ -87,8 +87,8 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
     """Return the complex transfer functions of the kernels of a lens, for a periodic field of shape (ny, nx).
     The result has shape (kernels, ny, nx).
 
-    The points of the source lie on the grid of the field's frequencies. Each point represents one cell of
-    this grid, and its weight is the share of the cell that the source fills.
+    The source is sampled on the frequency grid of the field. Each sample represents one cell of this grid,
+    and its weight is the share of the cell that the source fills.
 
     Raises:
         InputError: the source is a ring that is too thin for this grid.
@@ -131,8 +131,8 @@ def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
 
 
 def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
-    """Return the complex amplitude that passes through the pupil at each frequency. The phase of this
-    amplitude comes from the defocus.
+    """Return the complex amplitude that passes through the pupil at each frequency. The phase of the
+    amplitude describes the defocus.
     """
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)

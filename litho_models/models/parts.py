@@ -1,6 +1,6 @@
-"""Parts from which modular models of printers are assembled. A part contains three things: a function that
-turns one field, such as a dose, into the next field; the parameters of this function; and a reference for its
-formula.
+"""Parts from which modular models of printers are assembled. A part contains a function that turns one field,
+such as a pattern, into the next field, such as a dose. It also contains the parameters of this function and a
+reference for its formula.
 
 Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. The
 field that a part returns may be cropped on each side by the receptive radius of the part.
@@ -44,8 +44,9 @@ class Number:
 
     Attributes:
         start: starting value; ``unit``: unit of the parameter, or ``1`` if it has none.
-        lower, upper: range of the parameter. If ``upper`` is None, the upper limit of a length is five times
-            its starting value, and other parameters have no upper limit.
+        lower, upper: range of the parameter. If ``upper`` is None and the parameter is a length in µm, its
+            upper limit is five times its starting value. If ``upper`` is None and the parameter has another
+            unit, it has no upper limit.
         fitted: whether the parameter is fitted; otherwise it keeps its value.
     """
 
@@ -92,9 +93,9 @@ def illuminate(
     """Expose a pattern with a spot that is a sum of Gaussians: Σ share · G_sigma. Return the dose, cropped by
     ``reach_px`` pixels on each side.
 
-    One Gaussian describes light or a fine beam. A second, wide Gaussian describes backscattered electrons
-    (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third Gaussian with a width between these two may be
-    added.
+    The first Gaussian describes light or a fine beam. A second, wide Gaussian describes backscattered
+    electrons (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). An optional third Gaussian has a width between
+    those of the first two.
 
     Args:
         pattern: pattern to write, whose pixel pitch is ``pitch_um``, µm; ``spots``: share and standard

@@ -160,8 +160,8 @@ class Pbl(Simulator):
     The variant ``default`` adds two feature networks to this chain of steps. ``surroundings`` describes how
     the layout within some micrometres of a pixel influences its height. This influence is the same along x
     and y. ``scan_axis`` describes how the height along x influences the measured height. This second
-    influence may come from the microscope. The fit includes ``scan_axis``, so that the other networks do not
-    learn this influence. ``printer()`` returns the model without ``scan_axis``.
+    influence may come from the microscope. ``scan_axis`` takes part in the fit, so that the other networks do
+    not learn the influence of the microscope. ``printer()`` returns the model without ``scan_axis``.
     """
 
     name = "pbl"

@@ -93,15 +93,15 @@ class Physics(Simulator):
     """The Physics model: H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀). The shrinkage factor
     S depends on G_diffusion * Ĥ. M is the layout, H the printed height, g a gain and b a height bias.
 
-    In the variant ``default``, H₀ is the nominal height of the highest level, and the gain is fitted. If the
-    gain were fixed at 1, the highest level would always print at H₀ + b. In ``paper`` and ``authors``, H₀ is
-    1 µm and g is 1. If the threshold is below 0, it lies below the lowest level, and the projection uses only
-    the concave part of the tanh.
+    In the variant ``default``, H₀ is the nominal height of the highest level, and the gain is fitted. With a
+    fixed gain of 1, the highest level would always print at H₀ + b. In the variants ``paper`` and
+    ``authors``, H₀ is 1 µm and g is 1. If the threshold is below 0, it lies below the lowest level, and the
+    projection uses only the concave part of the tanh.
 
     The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
     ``default`` scales the diffused dose by a fixed range. ``paper`` uses the range of the dose over the
     layout, and ``authors`` uses the maximum of the dose over the layout. In ``paper`` and ``authors``, the
-    height of a pixel therefore changes if the layout is cropped differently.
+    predicted height of a pixel therefore depends on how the layout is cropped.
     """
 
     name = "physics"

@@ -16,8 +16,8 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 class PrinterConfig(SimulatorConfig):
     """Configuration of a printer: its parts, in the order in which they act, and the values of their
-    parameters. A fitted parameter starts at its value; any other parameter stays at its value. The name of a
-    parameter has the form ``part.parameter``.
+    parameters. The configured value of a fitted parameter is its starting value; all other parameters keep
+    their configured values. The name of a parameter has the form ``part.parameter``.
 
     A parameter can also be set under this name, such as ``spot.sigma_um``, as if it were a field of the
     configuration.

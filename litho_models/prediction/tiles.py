@@ -65,8 +65,8 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     """Predict the height, µm, of the pixels that are at least ``border_px`` pixels from the edge of the
     layout. The height is differentiable in the layout.
 
-    The border must be less than half as wide as the layout. The result equals the result of ``predict_field``
-    without this border. If the model allows it, only the pixels of the result are computed (see
+    The border must be less than half as wide as the layout. The result is the height that ``predict_field``
+    returns, cropped by this border. If the model allows it, only the pixels of the result are computed (see
     ``FrozenSimulator.inside``).
     """
     reach = model.reach_px
@@ -83,8 +83,8 @@ def blend_tiles(
     """Compute ``function`` on overlapping tiles of a layout and blend the results. At each pixel, the result
     is a weighted mean over the tiles that contain it, with weights that add up to one.
 
-    The first tile starts ``overlap_px`` pixels outside the layout, where the outermost pixels of the layout
-    are repeated. The weights therefore also add up to one at the edge of the layout.
+    The layout is extended by repeating its outermost pixels, and the first tile starts ``overlap_px`` pixels
+    outside the layout. The weights therefore also add up to one at the edge of the layout.
 
     Args:
         function: receives tiles of shape (batch, 1, T, T) and returns heights of the same shape.

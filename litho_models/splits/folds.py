@@ -87,8 +87,8 @@ def plan_folds(
     open_lock_box: bool = False,
 ) -> list[Fold]:
     """Return the folds of a split. In the split ``paper``, training and held-out sets contain quadrants of
-    the same scans, and locked scans are used. The other splits use the locked scans only if ``open_lock_box``
-    is set. The locked scans are then held out in an additional fold.
+    the same scans, and no scans are locked. All other splits leave out the locked scans unless
+    ``open_lock_box`` is set, in which case an additional fold holds them out.
 
     Raises:
         InputError: there are too few scans, there are no locked scans although ``open_lock_box`` is set, or
@@ -191,9 +191,9 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose training scans to be set aside, and return their ids. The error on these scans decides which
-    round of a training is the best. ``count`` scans are chosen, but at most a quarter of the training scans
-    in ``ids``.
+    """Choose the validation scans of a training, and return their ids. The error on these scans decides which
+    round of the training is the best. ``count`` scans are chosen, but at most a quarter of the scans in
+    ``ids``.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))
