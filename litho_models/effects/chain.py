@@ -48,8 +48,8 @@ class EffectChain(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile size with which the base model is applied. Effects, in contrast, are applied to the
-        whole field.
+        """Return the size of the tiles to which the base model is applied. (Effects are applied to the whole
+        field.)
         """
         return self.base.tile if isinstance(self.base, Simulator) else None
 

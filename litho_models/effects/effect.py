@@ -107,8 +107,8 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Return a quantity that depends only on this field. At the first call, the function ``make``
-        computes the quantity. Later calls with the same ``name`` return the cached result.
+        """Return the quantity ``name``, which depends only on this field. The first call computes it with the
+        function ``make``; later calls return the cached result.
         """
         if name not in self._kept:
             self._kept[name] = make(self)
@@ -169,8 +169,8 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise InputError. This function takes the place of the formula in a per-scan effect, whose terms are
-    fitted to each scan instead.
+    """Raise InputError. A per-scan effect has this function instead of a formula, because its terms are
+    fitted to each scan separately and do not become part of a model.
     """
     raise InputError(
         "an effect in a model",
@@ -189,20 +189,21 @@ class Effect:
         stage: stage of printing or measurement at which the effect acts.
         role: ``process`` if the printer causes the effect; ``measurement`` if the microscope causes it;
             ``undetermined`` if it is not known whether the printer or the microscope causes it; ``nuisance``
-            if designs should not depend on the effect. Only ``process`` effects become part of the exported
-            process model.
+            if designs should not depend on the effect, whatever causes it. Only ``process`` effects become
+            part of the exported process model.
         acts_on: what the effect changes: ``layout``, the input of the base model, or ``height``, the output
             of the base model. Both are in µm.
         parameters: the parameters, keyed by name. At least one of them must be an amplitude.
         apply: the formula, a pure function ``apply(field, values, context)`` that returns the changed field.
             The field given and the field returned have shape (b, 1, ny, nx) and are in µm. For per-scan
             effects, ``apply`` is ``of_single_scans``.
-        trials: parameter sets that screening tries. By default, each set switches on one amplitude. The sets
-            contain all combinations of the ``tried`` values of this amplitude and of the shapes.
+        trials: parameter sets that screening tries. By default, each set switches on only one amplitude, and
+            the sets contain all combinations of the ``tried`` values of this amplitude with the ``tried``
+            values of the shapes.
         source: where the formula comes from, such as a publication.
         separating: experiment that distinguishes this effect from similar effects.
-        needs: requirements for a test of the effect. ``order``: the writing order of the scans must be known.
-            ``probe``: the microscope must have a probe.
+        needs: what must be given before the effect can be tested. ``order``: the writing order of the scans
+            must be known. ``probe``: the microscope must have a probe.
         reverses: names of the parameters whose sign changes between trace and retrace lines.
         of_tip: whether the effect is absent from scans made with a new tip.
         of_films: True if this effect moves the edges of a film seen from above, and False if it changes

@@ -97,9 +97,9 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     """Cure slices of height t separately: the blurred layout G*M becomes
     (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
 
-    The effect adds this change, i.e. the second expression minus the first, to the height. The function
-    ``step`` is a logistic function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice
-    that is narrower than the spot is lost, and a gap that is narrower than the spot is filled.
+    The effect adds the second expression minus the first to the height. The function ``step`` is a logistic
+    function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
+    spot is lost, and a gap that is narrower than the spot is filled.
     """
     exposed = context.kept("slices", _exposed_slices)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed

@@ -133,8 +133,8 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shorten every written line by δ at both ends (δ < 0 lengthens it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    At an edge, the formula gives the lost area correctly, but not the shape. The error of the shape does not
-    matter, because the spot is wider than δ and determines the shape of the edge.
+    At an edge, the formula removes the correct area, but gives the edge a wrong profile. This error does not
+    matter, because the spot is wider than δ and determines the profile of the edge.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()

@@ -115,8 +115,9 @@ _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards by bias · (2 M̄ - 1), where M̄ is the mean of the film (0 to 1) near the edge. If
-    the bias is positive, edges with little film nearby therefore move inwards.
+    """Move edges outwards by bias · (2 M̄ - 1), where M̄ is the (Gaussian-weighted) fraction of the area near
+    the edge that the film covers. If the bias is positive, edges with little film nearby therefore move
+    inwards.
     """
     length = values["length_px"]
     nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
@@ -127,10 +128,10 @@ FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
 
 
 def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
-    """Move the edges of a film outwards along their normals. Films or gaps narrower than twice the shift
-    vanish. If the shift widens a film or gap that was narrower than twice ``_FLAT_PX``, the result is up to
-    0.8 px too narrow. An edge moves too little if its transition from film to gap extends farther than
-    ``_FLAT_PX`` to each side.
+    """Move the edges of a film outwards along their normals. Films that are narrower than twice an inward
+    shift vanish, and so do gaps that are narrower than twice an outward shift. If the shift widens a film or
+    gap that was narrower than twice ``_FLAT_PX``, the result is up to 0.8 px too narrow. An edge moves too
+    little if its transition from film to gap extends farther than ``_FLAT_PX`` to each side.
     """
     share = height[0, 0].detach() / context.full_height_um
     reach_px = float(outwards_px.detach().abs().max()) + _FLAT_PX + 1

@@ -2,10 +2,10 @@
 a function of the height, the slopes, the surroundings, the position in the scan or the writing order.
 
 A law is an effect with one strength (a law that adds a wave has two) and with fitted shapes, such as a power,
-a length, a direction or a position. A law does not state the cause of the departure. Laws are screened,
-fitted, judged and applied by the same code as other effects. A table is an effect with many strengths. A
-table can describe any dependence on one covariate, such as the level or the position, but does not explain
-this dependence.
+a length, a direction or a position. A law does not state the cause of the departure. The same code screens,
+fits, judges and applies laws and all other effects. A table is an effect with many strengths. A table can
+describe any dependence on one covariate, such as the level or the position, but does not explain this
+dependence.
 """
 
 from __future__ import annotations
@@ -140,8 +140,9 @@ def _law(
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
     """Make a law that adds a sine wave to a field (height or dose). The phase of the wave is proportional to
-    the value of the field itself. A wave in the dose describes the effect of slices, and a wave in the height
-    describes standing waves of light. The added wave is zero where the field is zero.
+    the value of the field itself. If the field is a dose, the law describes the effect of slices. If the
+    field is a height, the law describes standing waves of light. The added wave is zero where the field is
+    zero.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:

@@ -37,10 +37,10 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     """Let the probe lag along the fast axis: from pixel to pixel, the measured height z follows the surface H
     by z += (H - z) / (1 + l / dx). The mean delay is removed.
 
-    The lag has length l on falling edges, and length ``rising`` × l on rising edges, where the surface pushes
+    The length of the lag is l on falling edges, and ``rising`` × l on rising edges, where the surface pushes
     the probe. If ``rising`` is 1, the probe acts as a linear filter. If ``rising`` is below 1, the probe
-    parachutes off falling edges, i.e. it loses contact there. The time constant of the lag is fixed, so l is
-    shorter if the pixels are smaller.
+    follows falling edges more slowly than rising edges, because it loses contact there (parachuting). The
+    time constant of the lag is fixed, so l is shorter if the pixels are smaller.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -132,8 +132,8 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """Dilate rows by a parabola. The surface is approximated by linear pieces that are half a pixel long.
     ``height`` and the result have shape (..., nx).
 
-    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point does
-    not lie on the piece, the tip touches the piece at the end that is nearer to this point.
+    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If the piece does
+    not extend to this distance, the tip touches the piece at its nearer end.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)

@@ -68,7 +68,9 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
     separating="a wide staircase of all levels",
 )
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Reduce the height of tall structures, which grow less than the dose suggests: H / (1 + q |H|)."""
+    """Reduce the height of tall structures, whose height is less than proportional to the dose: H / (1 + q
+    |H|).
+    """
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
 
@@ -154,8 +156,8 @@ def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Ten
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
     """Apply a morphological closing by a square to the height, which fills pits narrower than the square.
 
-    The square must be an odd number of pixels wide. For other widths, the result is interpolated between the
-    results for the next smaller and the next larger of these squares.
+    A closing can be computed only for squares that are an odd number of pixels wide. For other widths, the
+    result is interpolated between the closings by the next smaller and the next larger of these squares.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
@@ -179,8 +181,8 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
 
 
 def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
-    """Return the maximum over 2 half_px + 1 neighbours along an axis. Each step of the computation doubles
-    the number of neighbours that are included.
+    """Return, for each pixel, the maximum over 2 half_px + 1 pixels along an axis. Each step of the
+    computation doubles the number of pixels that are included.
     """
     size, width = 2 * half_px + 1, 1
     while width < size:
