@@ -29,8 +29,8 @@ def new(
     scans: Annotated[int, option("scans in each store", min=2)] = 12,
     size_px: Annotated[int, option("side of a layout, in pixels of 0.1 µm")] = 256,
 ) -> None:
-    """Simulate prints and scans with hidden causes in the virtual fab. A loop under test receives only the
-    stores; ``board judge`` also reads the hidden causes.
+    """Simulate prints and scans with hidden causes in the virtual fab. The loop that is tested receives only
+    the stores; ``board judge`` also reads the hidden causes.
 
     Example: litho-models board new --trials 8 --out board
     """

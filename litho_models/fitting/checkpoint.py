@@ -20,7 +20,7 @@ from litho_models.simulator import Simulator
 
 
 class RoundRecord(Record):
-    """The record of one round of training. The validation error is None if there are no validation scans."""
+    """The record of one round of training. If there are no validation scans, the validation error is None."""
 
     step: int
     training_mae_nm: float
@@ -58,8 +58,8 @@ class TrainingState:
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
     """Context manager for a block that reads the files of an earlier run from ``folder``. Any error in the
-    block becomes an InputError. A run writes each file completely or not at all, so a file that cannot be
-    read is damaged.
+    block becomes an InputError that reports a missing or damaged file. A file that cannot be read must be
+    damaged, because a run writes each file completely or not at all.
 
     Raises:
         InputError: a file is missing or damaged.

@@ -72,7 +72,8 @@ class TrainingConfig(Record):
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, *, film: bool = False, **settings: Any) -> Self:
         """Return the settings of a recipe for a model. Values in ``settings`` replace individual values of
-        the recipe. If ``film`` is True, no terms are fitted to the scans, unless ``settings`` names a policy.
+        the recipe. ``film`` states whether the scans are micrographs of films. To such scans, no terms are
+        fitted unless ``settings`` names a policy.
 
         The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
         of 72 quadrants. This recipe uses the learning rates of the paper and fits no per-scan terms. The
@@ -110,8 +111,8 @@ class TrainingConfig(Record):
         least squares.
 
         A large model is trained by gradient descent unless it is linear in its parameters. A small or linear
-        model is trained by gradient descent only with the recipe ``paper``, and only if the paper states a
-        learning rate for this model.
+        model is trained by gradient descent only if the recipe is ``paper`` and the paper states a learning
+        rate for this model.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)

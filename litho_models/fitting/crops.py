@@ -21,9 +21,9 @@ FEWEST_PIXELS = 1024
 
 
 def part_to_fit(counts: Sequence[int], usual: int) -> int:
-    """Choose which part of a scan is fitted, and return the index of this part. The part ``usual`` is fitted
-    if it has enough measured pixels, and otherwise the part with the most measured pixels. ``counts``
-    contains the number of measured pixels of each part.
+    """Return the index of the part of a scan that is fitted: ``usual`` if the part with this index has enough
+    measured pixels, and otherwise the part with the most measured pixels. ``counts`` contains the number of
+    measured pixels of each part.
     """
     enough = counts[usual] >= min(FEWEST_PIXELS, max(counts))
     return usual if enough else int(np.argmax(counts))
@@ -84,7 +84,7 @@ def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Wind
     """Divide the windows of a step into groups, which the network processes one after the other.
 
     On a CPU, a group has at most ``_PASS_PX`` pixels, unless a single window is larger. Groups of this size
-    limit the memory without taking more time. On other devices, all windows form one group.
+    need less memory and no more time than all windows at once. On other devices, all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":

@@ -131,7 +131,7 @@ def fit_in_cache(
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
     """Fit ``FIRST_MODEL`` to the scans, and return the heights, µm, that it predicts for them. The training
-    of a network uses these heights for its first estimate of the per-scan terms.
+    of a network estimates its first per-scan terms from these heights.
     """
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":

@@ -70,9 +70,9 @@ class Rules:
     Attributes:
         loss: ``absolute`` to minimise the sum of absolute residuals, ``squares`` to minimise the sum of
             squared residuals.
-        term_weight: weight of the part of a residual that the terms of the scan can explain. It is used with
-            the loss ``squares``. The weight is not zero, so the fit determines the common datum of all scans.
-            The weight is small, so the terms of a single scan do not bias the parameters.
+        term_weight: weight of that part of a residual that the terms of the scan can explain; used with the
+            loss ``squares``. The weight is small, so the terms of a single scan do not bias the parameters.
+            It is not zero, because the fit must also determine the common datum of all scans.
         pinned: number of pinned terms. The mean of a pinned term over the scans is held at zero. Pinned terms
             are used with the loss ``absolute`` and are the first rows of ``Linearised.basis``.
         steps: largest number of steps.
@@ -80,7 +80,7 @@ class Rules:
         tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
             attempt.
         lowest_damping: lower limit of the damping.
-        kept_above: the derivatives are reused for the next step if the last step reduced the loss by at least
+        kept_above: the next step reuses the derivatives if the last step has reduced the loss by at least
             this fraction of the predicted reduction. With None, the derivatives are computed anew after every
             step.
     """
@@ -276,9 +276,9 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
     """Find the damped step x within its limits by minimising x·A·x / 2 - b·x + damping · x·diag(A)·x / 2. The
     matrix A may be singular, because some parameters may have no effect.
 
-    The limits are part of the minimisation. If the unlimited step were clipped to the limits afterwards, the
-    steps of the other parameters would not take the clipping into account. Fits whose optimum is on a bound
-    would then converge slowly.
+    The minimisation takes the limits into account. If the unlimited step were only clipped afterwards, the
+    steps of the other parameters would not match the clipped steps, and fits whose optimum is on a bound
+    would converge slowly.
 
     Args:
         normal, right: the positive semi-definite matrix A, of shape (p, p), and the vector b, of shape (p,).

@@ -50,8 +50,9 @@ def fit_feature_networks(
     Line offsets are not fitted as per-scan terms here, because they average out over a scan.
 
     Returns:
-        The record of this fit, which counts as one round. Its errors are computed after the per-scan terms
-            are removed. The ``validation`` scans do not influence the fit.
+        The record of this fit, which counts as one round of training. The errors in the record are computed
+        after the per-scan terms are removed. The ``validation`` scans are only scored and do not influence
+        the fit.
     """
     started = time.monotonic()
     terms = smooth_training_terms(config.nuisance)

@@ -50,8 +50,8 @@ def train_network(
 
     The best round is the one with the smallest error on the ``validation`` scans, or the last round if there
     are none. ``first_predictions_um`` returns the heights, µm, that a small model predicts for the training
-    scans. From these heights, the per-scan terms of the first round are estimated. ``first_predictions_um``
-    is not called if an interrupted run continues after its first round.
+    scans. The per-scan terms of the first round are estimated from these heights. If an interrupted run
+    continues after its first round, ``first_predictions_um`` is not called.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -130,8 +130,8 @@ class _Targets:
     """The training data of one round: the layouts of the training scans, their measured heights without the
     per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
 
-    Each layout is extended by ``overhang_px`` pixels on each side, where its outermost pixels are repeated.
-    The added pixels also have weight zero.
+    Each layout is extended by ``overhang_px`` pixels on each side, which repeat its outermost pixels. The
+    added pixels also have weight zero.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
@@ -217,8 +217,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
-    """Return the number of pixels by which tiles may extend beyond a scan in training. This number is at
-    least the overlap of the tiles, as in prediction. If a scan is smaller than a tile, the number is so large
+    """Return the number of pixels by which tiles may extend beyond a scan in training. As in prediction, this
+    number is at least the overlap of the tiles. If a scan is smaller than a tile, the number is larger, so
     that the extended scan contains a whole tile.
     """
     if model.tile is None or config.crops != "random":

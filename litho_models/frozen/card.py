@@ -62,9 +62,9 @@ class ModelCard(RunFacts, Result):
     ``at_bounds`` contains the fitted values that lie on a bound of their range, as a dict from the name of
     the value to the bound. ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on
     which the model was trained; ``litho-models check`` compares new prints with these values. For some
-    effects, the measurements do not show whether the printer or the microscope causes the effect. Such an
-    effect can be attributed to the printer or to the microscope when the model is frozen. ``attributed`` maps
-    the name of the effect to ``printer`` or ``microscope``.
+    effects, the measurements do not show whether the printer or the microscope causes them. The user can
+    attribute such an effect to one of the two when the model is frozen; ``attributed`` maps the name of the
+    effect to ``printer`` or ``microscope``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)

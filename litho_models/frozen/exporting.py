@@ -76,8 +76,9 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 
 
 class _Numbers(TorchDispatchMode):
-    """A torch mode for two runs of a model. In the first run, it records the Python numbers that the model
-    reads from tensors with ``Tensor.item``. In the second run, it returns the same numbers.
+    """A torch mode that makes a model use fixed Python numbers. In a first run, the mode records the numbers
+    that the model reads from tensors with ``Tensor.item``. In a later run, ``Tensor.item`` returns these
+    numbers.
 
     These numbers are the radii of blur kernels and the end points of tables. Radii and end points depend only
     on the weights, so the exported program may contain them as constants.

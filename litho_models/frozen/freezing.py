@@ -32,17 +32,18 @@ def freeze(
     Args:
         source: a folder that ``train`` or ``close-loop`` wrote, or a frozen model (a folder or ``zoo:NAME``).
         out: output folder for the frozen model.
-        attribute: side (``printer`` or ``microscope``) to which effects of undetermined role are attributed.
-            (The measurements do not show on which side these effects arise.) The value is either one side for
-            all of these effects, or a mapping from the name of an effect to its side. Effects attributed to
-            the printer become part of the frozen model; those attributed to the microscope do not. The card
-            records the attribution. The name ``scan-axis`` stands for the part of a base model that acts
-            along the lines of the scan. If this part of the base model is left out, the card of the frozen
-            model states no background and no baseline.
+        attribute: ``printer`` or ``microscope``, to which effects of undetermined role are attributed. (The
+            measurements do not show which of the two causes these effects.) The value is either one of the
+            two for all of these effects, or a mapping from the name of an effect to one of the two. Effects
+            attributed to the printer become part of the frozen model; those attributed to the microscope do
+            not. The card records the attribution. The name ``scan-axis`` stands for the part of a base model
+            that acts along the lines of the scan. If this part of the base model is left out, the card of the
+            frozen model states no background and no baseline.
 
     Raises:
-        InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a side
-            is unknown; or ``scan-axis`` is attributed to the printer, but the model was frozen without it.
+        InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a value
+            is neither ``printer`` nor ``microscope``; or ``scan-axis`` is attributed to the printer, but the
+            model was frozen without it.
     """
     folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER

@@ -20,8 +20,9 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     """Predict the print of a layout file, and write its height to ``out``. Return the height in µm, as an
     array of shape (ny, nx), and a phrase that says what was assumed beyond the edge of the layout.
 
-    A file that ``litho-design`` exported contains an element that stands alone on the substrate, so level 0
-    is assumed beyond its edge. Every other layout is continued by repeating its outermost pixels.
+    If ``litho-design`` exported the file, it contains an element that stands alone on the substrate, so level
+    0 is assumed beyond the edge of the layout. Every other layout is continued by repeating its outermost
+    pixels.
 
     Args:
         layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. The file contains the level
@@ -88,8 +89,8 @@ def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """Return the ids of the scans in a store that were locked when the model was trained. The scans are
     recognised by their raw files.
 
-    Raw files are compared because they stay the same if the store is built anew. Heights change if the
-    settings for levelling or registration change, and the choice of locked scans changes if scans are added
+    Raw files are compared because a new build of the store leaves them unchanged. The heights in the store
+    change with the settings for levelling and registration, and other scans may be locked if scans are added
     to the store or removed from it. If the card lists no raw files, the scans are recognised by their ids
     instead, but only if the store has the dataset name that the card states.
     """
