@@ -41,10 +41,9 @@ def evaluate(
     """Score a frozen model on the scans of a store and write the result and its report.
 
     A scan counts as locked if it is in the lock box of this store, or if it was locked when the model was
-    trained. Locked scans are left out in two cases: the model was trained on this store, or scans of this
-    store were locked when the model was trained. With ``open_lock_box``, locked scans are scored too. In all
-    other cases, all scans are scored. The result states which scans are locked and whether any of them was
-    scored.
+    trained. Locked scans are left out if the model was trained on this store, or if scans of this store were
+    locked when the model was trained. Otherwise, or with ``open_lock_box``, all scans are scored. The result
+    states which scans are locked and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.

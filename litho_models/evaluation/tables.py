@@ -77,9 +77,9 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
     """Return a table of mean absolute errors. There is one column for each policy (set of per-scan terms).
-    Each model has one row of errors with the background of the protocol. If there is a background, a second
-    row states the errors without it. For the policy with line offsets (``full+rows``), a second column states
-    the effective number of terms per scan.
+    Each model has one row. If the protocol states a background, this row contains the errors with the
+    background, and a second row contains the errors without it. For the policy with line offsets
+    (``full+rows``), a second column states the effective number of terms per scan.
 
     The last row is the noise floor for each policy.
     """

@@ -6,11 +6,11 @@ a step at this print and stays changed until the last print. A t test with a poo
 before the step, including all reference prints, with the values after the step. Although the mean and the
 spread must be estimated from the prints, Student's t distribution is exact for any number of reference
 prints. The method is the likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu
-and Kang 2003, J. Quality Technology 35, 355). The rate of false alarms is divided among the comparisons
-(Bonferroni). The rate of all comparisons together is therefore not exceeded, even if they are correlated. A
-step should be noticed within ``SOON`` prints, so comparisons with at least ``SOON`` prints after the step get
-most of the rate. With three new prints, the test is nearly a t test of the mean of these three prints, which
-is the best possible test if the spread is unknown.
+and Kang 2003, J. Quality Technology 35, 355). The given rate of false alarms is divided among the comparisons
+(Bonferroni). All comparisons together therefore do not exceed this rate, even if they are correlated. A step
+should be noticed within ``SOON`` prints, so comparisons with at least ``SOON`` prints after the step get most
+of the rate. With three new prints, the test is nearly a t test of the mean of these three prints, which is
+the best possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -112,7 +112,7 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
     """Return the probability that a rise of the mean is noticed, i.e. raises an alarm within ``SOON`` prints.
-    If there are fewer new prints, the alarm may come within all of them.
+    If there are fewer new prints than that, the alarm must come within these prints.
 
     The result is a lower bound, because only one comparison is considered: the step is assumed at the first
     print after the rise. The statistic of this comparison has a noncentral t distribution. All values are

@@ -1,4 +1,4 @@
-"""Estimate the noise of prints, which is the part of the error that no model can predict. Also test whether
+"""Estimate the noise of prints, i.e. the part of the error that no model can predict. Also test whether
 stated uncertainties are calibrated.
 """
 

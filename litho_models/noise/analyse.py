@@ -35,8 +35,8 @@ def analyse_noise(
     """Analyse the noise of the prints in a store. Write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. The analysis also uses the reference scans in it (bare substrates, flat prints
-            and steps), and all scans with a stated dose.
+        store: dataset store. The noise is estimated from its repeated prints and its reference scans (bare
+            substrates, flat prints and steps). A dose matrix is made from all scans with a stated dose.
         out: result folder.
         residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
             With residuals, the analysis also contains the spread σ(x) of the residual at each pixel x, and a

@@ -28,9 +28,8 @@ class FlatLevel(Record):
     """The rms (``sigma_nm``) and the mean absolute value (``mae_nm``) of the residual at pixels of one level
     in areas where the layout is flat.
 
-    The residual is computed after the terms of the policy ``full+rows``, which include line offsets, are
-    removed from each scan. ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm``, from resampling
-    prints.
+    From each scan, the per-scan terms of the policy ``full+rows`` are first removed, including line offsets.
+    ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm``, from resampling prints.
     """
 
     level: int
@@ -46,8 +45,9 @@ class NoiseBudget(Record, extra="ignore"):
 
     ``floor`` is computed from pixels with similar surroundings (see ``floor_of_residuals``). ``flat_levels``
     is computed from the pixels at which the slope of the layout is at most ``flat_slope``, which is the lower
-    quartile of this slope. ``flat_texture`` is the texture of the residual at these pixels. For the texture,
-    only the terms of the policy ``full`` are removed, so it still contains line offsets.
+    quartile of this slope. ``flat_texture`` is the texture of the residual at these pixels. Only the terms of
+    the policy ``full`` are removed before the texture is computed, so the texture still contains line
+    offsets.
     """
 
     model: str

@@ -50,8 +50,8 @@ class ScanCalibration(Record, extra="ignore"):
 
     ``nll`` is the negative log-likelihood, and ``crps_nm`` is the continuous ranked probability score. For
     both, lower is better. ``coverage`` is the share of residuals inside the stated intervals, for each level
-    in ``Calibration.levels``. ``standardised_rms`` is the rms of the residual divided by the stated standard
-    deviation.
+    in ``Calibration.levels``. ``standardised_rms`` is the rms over the pixels of this ratio: residual divided
+    by stated standard deviation.
 
     ``ence`` and ``ause`` are fractions, for which 0 is best (see ``spread_scores``).
     """
@@ -91,8 +91,8 @@ class Calibration(Record, extra="ignore"):
 
 
 class SigmaBin(Record, extra="ignore"):
-    """The results for the pixels at which a covariate lies in a given range. They are the measured and the
-    predicted spread of the residual, and the coverage of the stated intervals.
+    """Results for the pixels at which a covariate lies in a given range: the measured and the predicted
+    spread of the residual, and the coverage of the stated intervals.
 
     The coverage is stated for the 68 % and the 95 % interval. Each coverage has a 95 % confidence interval
     from resampling prints. ``ence`` and ``ause`` are computed from the pixels in this range.
@@ -114,7 +114,7 @@ class SigmaBin(Record, extra="ignore"):
 
 class SpreadAnalysis(Record, extra="ignore"):
     """The spread σ(x) of the residuals of one model, and its calibration. ``bins`` is computed on scans that
-    were not used to fit the spread. ``variance`` is the model of the spread after a fit to all scans.
+    were not used to fit the spread. ``variance`` is the model of the spread, fitted to all scans.
 
     ``nuisance`` names the terms that were removed from the residuals. For each test, the spread is fitted
     anew without the data on which it is tested. ``left_out`` says whether these data are all scans of one

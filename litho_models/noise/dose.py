@@ -1,5 +1,5 @@
 """Evaluate a dose matrix, which is a set of prints at different doses. For each dose, determine the height,
-the roughness and the number of steps that were lost. Then recommend a dose.
+the roughness and the number of lost steps (steps that were printed much too low). Then recommend a dose.
 
 The paper searches for a laser power in this way (appendix "Mask and optical elements fabrication"). The
 evaluation uses all scans that state a dose. A layout is suitable if areas of one level are wider than the
@@ -53,8 +53,8 @@ class DoseRow(Record, extra="ignore"):
         lost_low: number of successive lost steps from the lowest level upwards. Steps are lost there because
             under-exposed resist does not remain. For each step, the height is divided by the number of levels
             that the step spans. The step counts as lost if this ratio is less than half the median ratio of
-            all steps at the same dose. If all steps shrink by the same factor, the median shrinks too, so
-            shrinkage does not count as wrong exposure.
+            all steps at the same dose. If all steps shrink by the same factor, the median shrinks too, so a
+            uniform shrinkage makes no step count as lost.
         lost_high: number of successive lost steps from the highest level downwards. Steps are lost there
             because over-exposed resist cannot react any further.
         worst_readability: smallest ratio of the height of a step to the standard deviation σ of single pixels
@@ -160,7 +160,8 @@ def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], lis
     """Return the scans that are used, and the mean and standard deviation of the height of each level. Only
     pixels that are far from every change of level are used. The datum, the tilt and the effect of the
     surrounding layout are first removed from each scan. A scan is used only if shared levels link it to the
-    scan with the most levels, directly or through other scans. Otherwise, its datum is unknown.
+    scan with the most levels, directly or through other scans. Without such a link, its datum would be
+    unknown.
     """
     found = [_level_parts(scan) for scan in scans]
     linked = _linked_levels(found)
@@ -234,8 +235,8 @@ def _common_heights_nm(scans: Sequence[Mapping[int, Array]]) -> dict[int, float]
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """Return blurred layouts minus the layout itself, µm. The blurs are Gaussians with standard deviations of
-    1 µm and 2 µm. The result has shape (2, ny, nx).
+    """Blur the layout by Gaussians with standard deviations of 1 µm and 2 µm. Return the two blurred layouts
+    minus the layout itself, µm. The result has shape (2, ny, nx).
     """
     return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 

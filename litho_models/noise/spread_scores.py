@@ -58,8 +58,8 @@ class Tails:
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Return half the width, in units of the scale of the distribution, of the central interval in which
-        a residual lies with the probability ``level``.
+        """Return half the width of the central interval that contains a residual with the probability
+        ``level``. The unit is the scale of the distribution.
         """
         return float(student.ppf(0.5 + level / 2, self.freedom))
 

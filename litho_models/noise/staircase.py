@@ -124,9 +124,8 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
 
     A piecewise-constant function is fitted to the profile of the staircase. At each position along the axis,
     the profile is the median of the heights along the line parallel to the edges. The fit minimises the
-    squared error plus a price for each edge. To set the price, consider two treads of the smallest width
-    whose heights differ by half a level. The price is the amount by which an edge between them reduces the
-    squared error.
+    squared error plus a price for each edge. The price is the reduction of the squared error by an edge
+    between two treads that have the smallest width and differ in height by half a level.
 
     A tilt along the axis would add edges, so the tilt is removed first. Columns or rows without a measured
     pixel are skipped.

@@ -25,8 +25,8 @@ class Period(Record, extra="ignore"):
         p: p value of the peak. It is the probability that random line means with a smooth spectrum have a
             peak that is at least as significant, at any frequency.
         amplitude_nm: amplitude of the oscillation with this period, as root mean square over the surfaces.
-        coherence: 1 if the lines have the same phase on all surfaces. The phase is counted from the first
-            pixel of each array.
+        coherence: agreement between the surfaces in the phase of the lines; 1 if the phase is the same on all
+            surfaces. The phase is counted from the first pixel of each array.
     """
 
     period_um: float

@@ -37,9 +37,9 @@ class ScanPart(PrintedScan):
 
 
 class Background(Record):
-    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². One fit to all training
-    scans gives the coefficients. ``scans`` is the number of these scans, in which a part of a scan counts as
-    a whole scan.
+    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². The coefficients come from
+    one fit to all training scans. ``scans`` is the number of these scans; each part of a scan counts as one
+    scan.
 
     x and y run from -1 to 1 over a whole field whose size (y, x) is ``field_um``. Each term has zero mean, so
     a background does not change the datum.

@@ -33,8 +33,8 @@ class CrossFit:
         residual_um: measured height minus predicted height minus terms, µm, of shape (ny, nx). It is NaN at
             pixels that are not scored.
         degrees_of_freedom: effective number of fitted terms, averaged over the scored parts of the scan. Line
-            offsets are shrunk towards zero, and each of them counts as a fraction of a term, which is its
-            shrinkage weight (0 to 1).
+            offsets are shrunk towards zero, and each of them counts not as a whole term but as its shrinkage
+            weight (0 to 1).
     """
 
     residual_um: FloatMap

@@ -60,9 +60,9 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     scan, and may define further groups. If all scan ids have the same length, groupings are also derived from
     the ids: for each position in the id, scans with the same character at this position form a group. With
     ``by_order``, groupings are also derived from the printing order. Such a grouping divides the scans into
-    those before and those after a position at which something may have changed. Any other grouping, except
-    ``all``, must have at least two labels, and at least half of its labels must have two or more scans. If
-    two groupings divide the scans in the same way, only the first is used.
+    those before and those after a position at which something may have changed. All groupings except ``all``
+    and those from the printing order must have at least two labels, and at least half of these labels must
+    have two or more scans. If two groupings divide the scans in the same way, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -125,8 +125,8 @@ class Block:
         columns: indices of the columns in the inner products, counted from 1, because index 0 is the
             residual.
         by: name of the grouping. Each label of the grouping has separate strengths.
-        shrinking: weight of the prior, which pulls the strengths towards zero. The weight is a number of
-            scans. If it is 0, there is no prior.
+        shrinking: weight of the prior, which pulls the strengths towards zero. The prior weighs as much as
+            this number of scans; 0 means that there is no prior.
     """
 
     columns: tuple[int, ...]
@@ -226,8 +226,8 @@ class _Expanded:
     Attributes:
         columns: indices of the columns of all blocks.
         rows: for each block and label, the row numbers of its strengths.
-        alike: sets of scans that have the same labels in the groupings of all blocks. Each set is a pair. It
-            contains the indices of the scans, and the row numbers of their strengths in the order of
+        alike: one pair for each set of scans that have the same labels in the groupings of all blocks. The
+            pair contains the indices of these scans, and the row numbers of their strengths in the order of
             ``columns``.
     """
 

@@ -50,8 +50,8 @@ class SharedPart(Record):
         by: name of the grouping whose groups have separate coefficients.
         coefficients: coefficients for each label of the grouping, in µm. For a gain, there is one
             dimensionless coefficient. A part without coefficients changes nothing.
-        shrinking: weight of the prior, which pulls the coefficients towards zero in the fit. The weight is a
-            number of scans.
+        shrinking: weight of the prior, which pulls the coefficients towards zero in the fit. The prior weighs
+            as much as this number of scans.
     """
 
     what: Shared
@@ -169,7 +169,9 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
-    """Fit a surface of the given kind to the usable pixels of a height map. Subtract it without its mean."""
+    """Fit a surface of the given kind to the usable pixels of a height map. Subtract this surface, but leave
+    the mean height of these pixels unchanged.
+    """
     if levelling == "none":
         return field
     shapes = polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]

@@ -45,8 +45,9 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights to try for the prior that pulls the coefficients of every group towards zero. A weight is a number
-# of scans. The ideal weight is the variance within groups divided by the variance between groups.
+# Weights to try for the prior that pulls the coefficients of every group towards zero. A prior with the
+# weight w weighs as much as w scans. The ideal weight is the variance within groups divided by the variance
+# between groups.
 _SHRINKING = (0.3, 1.0, 3.0)
 # A part is added only if the squared error on held-out scans falls by more than ``_LEAST_Z`` standard errors
 # of the decrease, and by more than the fraction ``_LEAST_SHARE`` of the squared error.

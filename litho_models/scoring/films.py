@@ -23,8 +23,7 @@ FILMS_TEXT = (
 
 class FilmErrors(NamedTuple):
     """The errors of a predicted film. ``area_error_percent`` is the absolute error of the predicted area, in
-    percent of the measured area. It is None if the measured area is zero. The other fields are numbers of
-    features.
+    percent of the measured area. It is None if the measured area is zero. The other fields count features.
     """
 
     area_error_percent: float | None

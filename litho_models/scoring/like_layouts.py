@@ -47,7 +47,7 @@ class LikePixels(NamedTuple):
         surroundings are similar. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k therefore estimates the
         variance of the noise in r₀, however large the noise of the partners is. A simpler estimate would be
         half the squared difference of two residuals. It would be too small for pixels with rare surroundings,
-        because such pixels are rougher than their partners.
+        because the noise at such pixels is larger than at their partners.
 
         Args:
             residuals: one residual map per scan, of shape (ny, nx). Both results have the squared unit of

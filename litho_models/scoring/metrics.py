@@ -19,8 +19,8 @@ INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """The line "measured height = slope · predicted height + intercept" that is fitted to a scan, and the
-    standard error of its slope.
+    """The straight line "measured height = slope · predicted height + intercept" that is fitted to a scan,
+    and the standard error of its slope.
 
     ``slope`` is None for a constant prediction. ``slope_error`` is None for a constant prediction, and if
     there is only one block.

@@ -156,9 +156,9 @@ def floor_of_residuals(
     the fraction of the squared error that is noise, in a random sample of pixels. The floor is the error over
     all scored pixels times the square root of this fraction. For the mean absolute error, this assumes that
     noise and residual have the same ratio of mean absolute value to standard deviation. The assumption is
-    true if nearly all of the residual is noise, whatever the distribution of the noise. In an unfavourable
-    case, the noise is Gaussian and the misfit has a Laplace distribution, or the reverse. If half of the
-    squared error came from such a misfit, the floor would be wrong by up to 6 %.
+    true if nearly all of the residual is noise, whatever the distribution of the noise. It fails, for
+    example, if the noise is Gaussian and the misfit has a Laplace distribution, or the reverse. If the misfit
+    then causes half of the squared error, the floor is wrong by up to 6 %.
 
     Args:
         model: name of the model, which is stated in the field ``source`` of the result.

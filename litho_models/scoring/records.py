@@ -120,11 +120,11 @@ class ModelScores(MetricValues, extra="ignore"):
     """All scores of one model. Errors are means over scans, counts are sums over scans, and confidence
     intervals come from resampling scans.
 
-    ``by_policy`` contains the mean absolute error for each policy, with the background of the protocol.
-    ``without_background`` contains the same errors without this background. ``without_background`` is empty
-    if the protocol has no background. If the background is smooth (``training``), ``without_background``
-    lists only policies without tilt and bow, because these terms would absorb the background.
-    ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes through the print.
+    ``by_policy`` contains the mean absolute error for each policy, with the background that the protocol
+    states. ``without_background`` contains the same errors without this background. ``without_background`` is
+    empty if the protocol has no background. If the background is smooth (``training``),
+    ``without_background`` lists only policies without tilt and bow, because these terms would absorb the
+    background. ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes through the print.
     """
 
     model: str
@@ -165,9 +165,9 @@ class ModelScores(MetricValues, extra="ignore"):
 
 
 class Paired(Record):
-    """The comparison of two models. ``mean_nm`` is the leading error (see ``ModelScores``) of the first model
-    minus the leading error of the second model, averaged over scans. If it is negative, the first model is
-    better. ``first_better`` counts the scans in which the first model is better.
+    """The comparison of two models. ``mean_nm`` is the leading error (see ``ModelScores.leading_nm``) of the
+    first model minus the leading error of the second model, averaged over scans. If it is negative, the first
+    model is better. ``first_better`` counts the scans in which the first model is better.
 
     ``over_prints`` is the same comparison with prints instead of scans as independent units. ``over_prints``
     is None if there is only one print, and in older result files.

@@ -104,9 +104,9 @@ def interval(values: Sequence[float]) -> Interval:
 
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
-    """Return combinations of signs for a sign-flip test, with shape (combinations, count). The first row is
-    the observed signs, all +1. For up to ``exact_scans`` scans, all combinations are returned. For more
-    scans, the observed signs and 9,999 random combinations are returned.
+    """Return combinations of signs for a sign-flip test, with shape (combinations, count). The first row
+    contains the observed signs, which are all +1. For up to ``exact_scans`` scans, all combinations are
+    returned. For more scans, the observed signs and 9,999 random combinations are returned.
     """
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)

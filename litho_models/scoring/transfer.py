@@ -101,10 +101,10 @@ def _band_powers(error: Array, prediction: Array, usable: Array, pitch_um: float
     The power spectral density is one-sided, in µm² per cycle/µm. Its sum divided by the number of terms is
     its mean.
 
-    ``error`` is measured minus predicted height, and 0 at pixels that are not usable. Therefore, if only a
-    share of a line is usable, the power of the error in this line is smaller by this factor. The power of the
-    prediction and the number of terms are multiplied by the same share, so that unusable pixels do not bias
-    the results.
+    ``error`` is measured minus predicted height, and 0 at pixels that are not usable. Unusable pixels
+    therefore lower the power of the error in their line. To lower the power of the prediction and the number
+    of terms in the same way, both are multiplied by the usable share of the line, weighted with the window.
+    Unusable pixels then do not bias the results.
     """
     window = np.hanning(error.shape[1])
     share = usable @ window**2 / np.sum(window**2)
