@@ -54,8 +54,8 @@ class MeasuredSource:
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph of a hologram's image, or of an object seen through a printed lens. Above the dark level,
-    the counts must be proportional to the light.
+    """A photograph of a hologram's image, or of an object seen through a printed lens. The counts minus the
+    dark level must be proportional to the light.
     """
 
     path: Path = setting(

@@ -571,8 +571,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     light = _light(seen(photo, pose), wanted, alike)
 
     def around(columns: list[int], covariance: np.ndarray) -> list[list[np.ndarray]]:
-        """Return a pair of maps for each independent change of the pose in these columns: the map after this
-        change, and the map after the opposite change.
+        """Let only the parameters of the pose with the numbers ``columns`` change. Return a pair of maps for
+        each independent change: the map after this change, and the map after the opposite change.
         """
         variance, ways = np.linalg.eigh(covariance)
         steps = np.zeros((len(columns), len(pose)))
@@ -593,8 +593,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
     """Return the covariance of a least-squares fit in which the residuals of neighbouring pixels are
     correlated. The covariance is computed from the scatter between tiles of the window, and each tile counts
-    as one observation (White 1980). The covariance thereby includes the effect of a print that differs from
-    the expected print and is apparently displaced by a different amount in each tile.
+    as one observation (White 1980). If the print differs from the expected print, it appears to be displaced
+    by a different amount in each tile. The covariance includes this effect.
     """
     tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
     number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))

@@ -54,10 +54,10 @@ class MeasuredRecord(Record):
     ``tilt_um_per_um`` (x, y) is the removed tilt, and ``bow_um`` is the height range of the removed bow over
     the element. ``noise_um`` is the standard deviation of the noise, estimated from spatial frequencies at
     which prints have no structure. Levelling also removes tilt and bow of the print itself. ``removed_sd_um``
-    is the expected standard deviation of each term of the print that is lost in this way. ``position_sd_um``
-    is the standard deviation of the position of a corner along one axis, and ``scale_sd`` is the relative
-    standard deviation of the height scale. ``defect_share`` is the share of the element that shows dust or
-    scars instead of the print.
+    is the expected standard deviation of each of these terms of the print. ``position_sd_um`` is the standard
+    deviation of the position of a corner along one axis, and ``scale_sd`` is the relative standard deviation
+    of the height scale. ``defect_share`` is the share of the element that shows dust or scars instead of the
+    print.
     """
 
     name: str

@@ -107,8 +107,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     image = photo.image()
     variants = photo.with_more_noise(), photo.with_other_faults(), photo.with_other_fits()
     freed, uncertainty = estimated(figures, figures(image), *variants)
-    # If the photograph is blurrier than the expected image, the cause may be the camera or the print. The
-    # effect of this blur on the score is therefore added to the uncertainty, in part.
+    # If the photograph is blurrier than the expected image, the cause may be the camera or the print. Part of
+    # the effect of this blur on the score is therefore added to the uncertainty.
     sharp, soft = (
         photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
         for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))

@@ -200,8 +200,8 @@ class BandedBench(nn.Module):
 
 
 def only(settings: Record, values: dict[str, Any]) -> None:
-    """Check that the settings in ``values`` have the values that are supported for a large element.
-    ``values`` maps the path of each of these settings to its only supported value.
+    """For some settings, a large element supports only one value. ``values`` maps the paths of these settings
+    to the supported values. Check that ``settings`` has these values.
 
     Raises:
         InputError: a setting has a different value.

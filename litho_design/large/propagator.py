@@ -27,8 +27,8 @@ _COLUMNS = 256
 
 
 class BandedPropagator:
-    """A propagator between equal grids for a field whose rows are divided among several processes. It
-    computes the same as the propagator from ``make_propagator``.
+    """A propagator between equal grids for a field whose rows are divided among several processes. It gives
+    the same result as the propagator from ``make_propagator``.
 
     The field and the result contain only the rows of this process, as complex64 of shape (rows, size). The
     kernel is even along both axes, so only half of each column of its Fourier transform is stored.

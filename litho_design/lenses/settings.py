@@ -110,8 +110,8 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
-    # The yield is measured with few draws, because each draw takes as long as ten steps of the search along a
-    # radius: it needs the light on the whole plane.
+    # The yield is measured with few draws. Each draw needs the light on the whole plane and therefore takes
+    # as long as ten steps of the search along a radius.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")

@@ -31,10 +31,9 @@ class ASMPropagator(KernelPropagator):
     is stored only at the separations that occur between the two grids. If the distance is negative, waves are
     propagated backwards and evanescent waves are dropped.
 
-    If the pixels are larger than half a wavelength, they represent rays only up to a certain angle, and the
-    result for waves of such rays is exact. If the pixels are smaller, they also represent rays close to
-    grazing. In this case, 1 % of the wave behind a rough element is missing or wrapped around, so
-    ``RSPropagator`` is the better choice.
+    Pixels larger than half a wavelength represent rays only up to a certain angle, and for these rays the
+    result is exact. Smaller pixels also represent rays close to grazing. Of the wave behind a rough element,
+    1 % is then missing or wrapped around, so ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of the two planes. Their pitches must be equal, but their shapes and origins may

@@ -21,8 +21,8 @@ class RadialPropagator(nn.Module):
     The propagated field U(p) is a sum over all rings. Each ring contributes its field u times the integral of
     h over the ring, where h is the kernel in ``RSPropagator``. The integral over a ring uses two
     Gauss-Legendre nodes across the ring and the midpoint rule around it. The integrand is periodic around the
-    ring, so the error of the midpoint rule decreases exponentially with the number of steps, once these
-    resolve the phase.
+    ring. As soon as the steps resolve its phase, the error of the midpoint rule therefore decreases
+    exponentially with the number of steps.
 
     Args:
         rings: number of rings; ring i covers the radii from i to i + 1 times ``ring_width_um``.

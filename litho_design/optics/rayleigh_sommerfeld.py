@@ -25,7 +25,8 @@ class RSPropagator(KernelPropagator):
     r^2 = x^2 + y^2 + z^2 and k = 2 pi / wavelength. In the time convention used here, exp(+j k r) is a wave
     that runs outwards (Goodman, Fourier Optics, ch. 3). The sum is computed exactly, because the kernel
     covers all separations between the two grids. If the two pitches differ, they must be in a ratio of small
-    integers. The kernel is then sampled at the largest pitch of which both are multiples.
+    integers. The kernel is then sampled at the largest pitch that fits into both pitches a whole number of
+    times.
 
     Args:
         source, target: grids of the two planes, with origin and pitch in µm.
@@ -69,9 +70,9 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Find the largest pitch of which the pitches of two grids are integer multiples. Return these two
-    integers: the first pitch and the second pitch, divided by the common pitch. ``pitches`` is the second
-    pitch divided by the first. Return None if one of the integers would exceed 16.
+    """Find the largest pitch that fits into the pitches of two grids a whole number of times. Return these
+    two numbers, first the number for the first grid. ``pitches`` is the second pitch divided by the first.
+    Return None if one of the two numbers would exceed 16.
     """
     found = Fraction(pitches).limit_denominator(_LARGEST_RATIO)
     if found.numerator > _LARGEST_RATIO or abs(found / Fraction(pitches) - 1) > 1e-12:

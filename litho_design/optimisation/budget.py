@@ -27,8 +27,8 @@ class Budget(Record):
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """Return one line that estimates the time and memory that a run still needs after the first ``done``
-        iterations: for the other iterations, the scores and the report.
+        """Return one line that estimates the memory and the remaining time of a run, after the first ``done``
+        iterations. The time includes the other iterations, the scores and the report.
         """
         left = search.iterations - done
         searched = (left + search.polish_rounds) * self.seconds_per_iteration

@@ -107,8 +107,9 @@ class EnsemblePenalty(Record):
 
 
 class Fabrication(Record):
-    """A penalty on layouts that are unlike the model's training layouts. The function ``outside`` computes
-    this penalty, and the search adds ``inside_weight`` times its result to the loss.
+    """A penalty on layouts that are unlike the model's training layouts. The function
+    ``litho_design.printers.training.outside`` computes this penalty, and the search adds ``inside_weight``
+    times the penalty to the loss.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})

@@ -17,11 +17,11 @@ from litho_design.printers.layout import LayoutSettings
 if TYPE_CHECKING:
     from torch import Tensor
 
-# A layout is flagged if its histogram of levels differs from the training layouts for more than half of the
-# pixels. Most of its print is then extrapolated.
+# A layout is flagged if the distance between its histogram of levels and that of the training layouts exceeds
+# this value. Most of the print of such a layout is extrapolated.
 _FLAG_DISTANCE = 0.5
-# A layout is also flagged if the histograms of steps differ for more than a tenth of all pairs of
-# neighbouring pixels. A few edges do not make a layout unusual.
+# A layout is also flagged if the distance between the histograms of steps exceeds this value, i.e. if more
+# than a tenth of the pairs of neighbouring pixels differ. A few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
 # A level or step is unusual if it is more frequent than in the training layouts, both by more than this
 # factor and by more than this difference of the shares.

@@ -44,7 +44,7 @@ class How(TypedDict, total=False):
         judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of the
             scores that these models predict is called the width of the design. By default, the judges are the
             zoo's models that were trained on the same prints as the model of the design.
-        robust: also use in the search those judges that provide gradients. ``Task.over_models`` then combines
+        robust: in the search, also use the judges that provide gradients. ``Task.over_models`` then combines
             the losses computed with the individual models, and a penalty on the disagreement of the models is
             added.
         device: torch device on which prints and waves are computed.
