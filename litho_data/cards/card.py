@@ -184,9 +184,9 @@ class Process(Record):
     """The ``[process]`` table: how raw scans are processed. It states the registration model, the radius of
     the tip, and the name of a file with a levelling recipe.
 
-    If ``level`` is missing and the card does not say that the scans are levelled, a plane is fitted to each
-    scan together with the layout, and this plane is subtracted. ``tip`` is the radius of the microscope's tip
-    in µm, or ``blind`` to estimate it from the scans.
+    Without ``level``, a plane is subtracted from each scan, unless the card says that the scans are levelled.
+    The plane is fitted together with the layout, so that no part of the print is removed. ``tip`` is the
+    radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
     """
 
     level: InsidePath | None = None

@@ -96,8 +96,8 @@ def takes_more(
     more: Sequence[inspect.Parameter],
     without: str = "",
 ) -> Callable[..., None]:
-    """Give the wrapper ``run`` all parameters of ``command`` except the one named ``without``, followed by
-    the parameters in ``more``.
+    """Give the wrapper ``run`` all parameters of ``command``, followed by the parameters in ``more``. The
+    parameter whose name is the value of ``without`` is left out.
     """
     own = inspect.signature(command, eval_str=True).parameters.values()
     kept = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own if one.name != without]

@@ -163,8 +163,8 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
     """For each frequency, return the power expected from the powers at the surrounding frequencies, and the
-    probability that chance alone would raise the power at least as far above the expected power as was
-    observed. ``scans`` is the number of scans over which the powers were averaged.
+    probability that chance alone gives at least the observed ratio of the power to the expected power.
+    ``scans`` is the number of scans over which the powers were averaged.
     """
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)

@@ -36,7 +36,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Away:
-    """A wrapper that lets another process run a function of this process in the working directory of this
+    """A wrapper of a function. Another process calls it to run the function in the working directory of this
     process. Results of the function record the command line of this process.
 
     ``plugins`` are plug-in files that the other process loads first. ``software`` states the versions and the

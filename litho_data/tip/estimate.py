@@ -50,8 +50,8 @@ class TipEstimate(RunFacts, Result):
         pixel_noise_nm, line_noise_nm: standard deviations of the noise of single pixels and of whole lines,
             averaged over the scans as a root mean square.
         window_px: side length of the windows in which curvatures were measured; None if there is no bound.
-        share: share of the sharp peaks that are about as sharp as the sharpest one. The share is high if the
-            tip limits how sharp peaks appear.
+        share: among the sharp peaks, the share of those that are about as sharp as the sharpest one. The
+            share is high if the tip limits how sharp peaks appear.
         pitch_um: pixel pitch of the scans along y and x, µm.
         scans: results for each scan.
     """

@@ -36,16 +36,16 @@ _SMALLEST_REACH_PX = 5.0
 _TIP_SHARE = 0.25
 # The tip limits the sharpness everywhere in a scan, but the sharpest peaks of a surface are in a few places.
 # The scan is therefore divided into 5 x 5 parts, and the share of the parts whose own edge exceeds 0.9 of the
-# whole scan's edge is computed. This share times the share that ``_TIP_SHARE`` limits must reach 0.13. This
-# limit rejects most of the estimates that are more than 10 % too large because of rounded bumps. If steep
-# walls and spikes are the cause, it rejects only one in twenty.
+# whole scan's edge is computed. This share times the share that ``_TIP_SHARE`` limits must reach 0.13. Of the
+# estimates that are more than 10 % too large, this limit rejects most of those from rounded bumps, but only
+# one in twenty of those from steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
-# If the tip limits how sharp peaks appear, valleys are sharper than peaks by at least this factor. They are
-# not if the surface limits the sharpness of the peaks, or, in most cases, if the peaks are noise.
+# If the tip limits how sharp peaks appear, valleys are sharper than peaks by at least this factor. This is
+# not so if the surface limits the sharpness of the peaks or, in most cases, if the peaks are noise.
 _SHARPER_VALLEYS = 1.2
-# The first value is the relative error of the method. Estimates for known tips scatter more than the scatter
-# among the parts of a scan explains, and the error is the unexplained part. The second is the number of
-# standard uncertainties that are added to the radius to give an upper bound.
+# The first value is the relative error of the method. It is the part of the scatter of estimates for known
+# tips that the scatter among the parts of a scan does not explain. The second value is the number of standard
+# uncertainties that are added to the radius to give an upper bound.
 _METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
 _SPAN = (0.5, 99.5)
 
