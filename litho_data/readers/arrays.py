@@ -99,8 +99,8 @@ class Held:
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
-        """Wrap an array that has already been read. ``described`` contains values for the fields that come
-        after ``read``, in the order of the fields.
+        """Make the object of an array that has already been read. ``described`` contains, in order, the
+        values of those fields of ``Held`` that follow the field ``read``.
         """
         native = np.array(values, dtype=values.dtype.newbyteorder("="))
         return cls(native.dtype, native.shape, partial(np.array, native), *described)
@@ -115,8 +115,8 @@ def array_channel(name: str, held: Held) -> Channel:
     """Make the channel of a two-dimensional array. The array is indexed [y, x] unless the names of its
     dimensions say otherwise.
 
-    In the channel, x grows to the right. The rows have the same order as in the file, whether y grows
-    downwards or upwards.
+    In the channel, x grows to the right. The rows keep the order of the file, so y may grow downwards or
+    upwards.
 
     Raises:
         InputError: the array has attributes that may scale its values in an unknown way (the message names

@@ -1,8 +1,8 @@
 """Run parsers of other projects in a child process, within limits of computing time and memory.
 
-A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. A process
-that reads files starts a single child process, at its first file, and uses this child for all files. A new
-child is started only after a parser has exceeded a limit or crashed.
+A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. When a
+process first needs such a parser, it starts a child process, and then uses this child for all files. It
+starts another child only after a parser has exceeded a limit or crashed.
 """
 
 import atexit
@@ -108,7 +108,7 @@ class _Child:
         self._owner = os.getpid()
 
     def _end(self, error: Exception, computing_s: float) -> str:
-        """End the child, and return a text for a message that says why the child gave no result."""
+        """End the child. Return the reason why it gave no result, as a text for a message."""
         assert self._process is not None
         if isinstance(error, TimeoutError):
             self._process.kill()

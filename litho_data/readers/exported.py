@@ -212,7 +212,7 @@ def read_stl_levels(
     """Read the levels of the cells in an exported STL, from the heights of the solid's upper faces. The
     result is a uint8 array of shape (ny, nx), with row 0 at the top.
 
-    Each face lies in a single cell of side ``cell_um``.
+    In such a file, no face extends over more than one cell. ``cell_um`` is the side of a cell.
 
     Raises:
         InputError: a cell has no upper face.

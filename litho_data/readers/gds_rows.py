@@ -77,7 +77,7 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Find where the rectangles of every cell are stored in the file, and which other cells the cell
+        """For every cell, find where its rectangles are stored in the file, and which other cells it
         contains.
         """
         at, cell, name = 0, "", ""

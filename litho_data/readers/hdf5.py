@@ -31,10 +31,10 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 def read_channels(path: Path) -> list[Channel]:
     """Return the channels of an HDF5 file.
 
-    JPK's and Nanosurf's files give one channel per signal and scan direction (trace and retrace), for each
-    frame or image. TopoStats' files give the flattened image and the raw image, both in nm. Thumbnails,
-    traces of grains and other tables in these files are skipped. Zygo's files are read with the library
-    SurfaceTopography, and all other files by ``read_hdf5``.
+    For files of JPK and Nanosurf, there is one channel per signal, scan direction (trace or retrace) and
+    frame or image. For files of TopoStats, the channels are the flattened image and the raw image, both in
+    nm. Thumbnails, traces of grains and other tables in these files are skipped. Zygo's files are read with
+    the library SurfaceTopography, and all other files by ``read_hdf5``.
 
     Raises:
         InputError: the file is damaged.

@@ -35,15 +35,15 @@ def read_layout(
         levels: number of levels of the layout; by default, up to 256 levels are accepted. If the file
             contains values too large for level numbers, it is read as a greyscale image in which white is the
             highest level. All its values must then be multiples of the same grey step.
-        average_px: side of a square in pixels, for an image with only two grey values. Each square of the
-            image becomes one pixel of the layout. The level of this pixel is the number of pixels in the
-            square that have the lighter grey value. Pixels at the right and at the bottom that do not fill a
-            square are cropped.
+        average_px: for an image with only two grey values, the side, in pixels, of the squares into which the
+            image is divided. Each square becomes one pixel of the layout. Its level is the number of pixels
+            in the square that have the lighter grey value. Pixels at the right and at the bottom that do not
+            fill a square are cropped.
 
     Raises:
         InputError: the file does not exist, is damaged, has a format that is not supported, or is not grey;
-            its values are neither levels nor multiples of the grey step; ``average_px`` is given but the
-            image has more than two grey values; or the sidecar belongs to another file.
+            its values are not levels or multiples of the grey step; ``average_px`` is given but the image has
+            more than two grey values; or the sidecar belongs to another file.
     """
     file = require_file(path)
     if says := export_of(file):
@@ -64,7 +64,9 @@ def read_layout(
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:
-    """Count the light pixels in each square of side ``side``, in px, of an image with two grey values."""
+    """Divide an image with two grey values into squares, and count the light pixels in each square. ``side``
+    is the side of the squares in pixels.
+    """
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:

@@ -58,8 +58,8 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
 
 
 def _marks(values: Array) -> list[tuple[float, int]]:
-    """Return the extreme values that look like marks of missing pixels, each with the number of its pixels.
-    The most extreme value comes first.
+    """Return the extreme values that look like marks of missing pixels, each with the number of pixels that
+    have it. The most extreme value comes first.
     """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     found: list[tuple[float, int]] = []

@@ -60,9 +60,9 @@ def read_scan(
         missing: numbers (as stored in the file) and words that mark pixels without a measurement, in addition
             to the marks that the file itself states. An empty list states that there are no such additional
             marks.
-        defaults: which of the arguments ``unit`` and ``size_um`` are only default values. If the file states
-            the unit or the size, the default is ignored. An argument that is not listed here must agree with
-            the file.
+        defaults: names of those of the arguments ``unit`` and ``size_um`` that are only default values. Such
+            a default is ignored if the file itself states the unit or the size. An argument that is not named
+            here must agree with the file.
 
     Raises:
         InputError: the file is unreadable; it has no height channel, or it has several and ``channel`` is not
@@ -128,8 +128,8 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
 
 
 def own_reader_sha256(path: str | Path, format: str = "auto") -> str:
-    """Return the hash of the source code of the registered reader that ``read_scan`` uses for a file. The
-    result is empty if ``read_scan`` uses a reader of this package.
+    """If the user registered the reader that ``read_scan`` uses for a file, return the hash of this reader's
+    source code. For a reader of this package, return an empty text.
 
     Raises:
         InputError: a reader has been registered, and the file is unreadable or has an unknown format.

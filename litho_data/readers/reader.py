@@ -142,8 +142,8 @@ def _refuse(problem: str) -> Loaded:
 
 
 def in_memory(values: Array) -> Callable[[], Loaded]:
-    """Make the function ``Channel.load`` for a map that has already been read. The function returns a copy of
-    the map.
+    """Return a function for the field ``Channel.load`` of a map that has already been read. The function
+    returns a copy of the map.
     """
     return partial(_copied, values)
 
@@ -181,7 +181,9 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 @contextmanager
 def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
-    """Silence Python warnings, and silence the named loggers up to and including the level ``above``."""
+    """Silence Python warnings and the messages of the named loggers. Only messages of a level higher than
+    ``above`` are still logged.
+    """
     named = [logging.getLogger(name) for name in loggers]
     levels = [logger.level for logger in named]
     try:
@@ -203,9 +205,9 @@ def foreign_parser(kind: str) -> Iterator[None]:
     Args:
         kind: name of the format that the parser reads, for the message, such as ``"TIFF"``.
 
-    On a damaged file, such parsers write to the log and raise errors of many types: struct, index, key,
-    value, memory, decoding and assertion errors, and types of their own. A caller could not handle so many
-    types in any useful way.
+    If a file is damaged, such a parser writes to the log and may raise an error of almost any type: a struct,
+    index, key, value, memory, decoding or assertion error, or a type of its own. A caller could not handle so
+    many types in any useful way.
     """
     try:
         with quiet(*_LOGGERS):

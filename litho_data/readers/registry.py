@@ -88,7 +88,7 @@ def require_file(path: str | Path) -> Path:
     """Return the path if it is a file that is not empty.
 
     Raises:
-        InputError: the path does not exist, is a folder, is not readable, or is an empty file.
+        InputError: the path does not exist or is a folder, or the file is empty or not readable.
     """
     file = Path(path)
     try:

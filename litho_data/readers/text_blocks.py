@@ -226,8 +226,8 @@ def is_row(line: str) -> bool:
     """Return whether a line is a row of numbers. This is the case if at least half of its cells are numbers,
     and if the line is not a comment and does not consist of a key and its value.
 
-    A word in a row marks a missing pixel. A line with fewer numbers is therefore also a row if it has at
-    least four cells, all its words are equal, and this word is not a unit.
+    A word in a row marks a missing pixel. A line in which less than half of the cells are numbers is
+    therefore a row too, if it has at least four cells, all its words are equal, and this word is not a unit.
     """
     if _COMMENT.match(line) or not line.strip():
         return False

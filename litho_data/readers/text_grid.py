@@ -50,9 +50,9 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
     """Remove the first row, the first column or both from a matrix, if they contain coordinates or pixel
     numbers.
 
-    Evenly spaced numbers are taken as coordinates, unless the next row or column has the same spacing. In
-    that case, both lines belong to the map, because neighbouring lines of a map are alike. The numbers 0, 1,
-    2, … (or 1, 2, 3, …) count pixels and say nothing about lengths.
+    A row or column of evenly spaced numbers is taken as coordinates, unless the row or column beside it has
+    the same spacing. In that case, both belong to the map, because neighbouring rows or columns of a map are
+    alike. The numbers 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing about lengths.
 
     Raises:
         InputError: the first row and column look like coordinates that are not evenly spaced, or the
@@ -126,8 +126,9 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 def _columns(words: Sequence[str], count: int) -> list[int]:
     """Return the indices, from 0, of the columns that contain x, y and z.
 
-    The columns are identified by the words above them. Without such words, the columns of a table with three
-    columns are taken as x, y and z. For any other table, the list is empty.
+    The columns are identified by the words above them. Without such words, a table with three columns is
+    taken to contain x, y and z in this order. For a table with another number of columns, the list is then
+    empty.
     """
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))

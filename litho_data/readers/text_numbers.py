@@ -181,7 +181,8 @@ def refuse_cut_end(text: str) -> None:
     as 5.4 m.
 
     Raises:
-        InputError: the last number has no exponent or a shorter one than the number before it.
+        InputError: the text does not end with a line break, and the last number has a shorter exponent than
+            the number before it, or has none although the number before it has one.
     """
     if text.endswith("\n"):
         return

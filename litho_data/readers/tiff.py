@@ -38,10 +38,10 @@ def read_channels(path: Path) -> list[Channel]:
     """Read one channel per page. In an RGB page, the three samples of each pixel must be identical.
 
     The pixel size is taken from OME metadata. Without OME metadata, it is taken from the resolution tags, but
-    only if ImageJ's metadata name the unit of these tags. Without such a unit, the resolution tags usually
-    describe a print on paper and not the sample. If ImageJ or GDAL stored a calibration of the values, it is
-    applied. Without a calibration, values are returned as stored. GDAL's no-data value marks missing pixels.
-    Copies of a page at reduced resolution are skipped.
+    only if ImageJ's metadata name the unit of these tags. Resolution tags without such a unit usually state
+    how large the image is when printed on paper, and not how large the sample is. If ImageJ or GDAL stored a
+    calibration of the values, it is applied. Without a calibration, values are returned as stored. GDAL's
+    no-data value marks missing pixels. Copies of a page at reduced resolution are skipped.
 
     Raises:
         InputError: the file is damaged.

@@ -61,7 +61,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """Return the formats whose signature the file has, by the names that SurfaceTopography uses."""
+    """Return SurfaceTopography's names of the formats whose signature the file has."""
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
@@ -77,8 +77,8 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Return whether a file begins with the header of an Igor wave. Such a header has a known version number
-    and a correct checksum. For version 5, which is the usual version, the checksum is not tested.
+    """Return whether a file begins with the header of an Igor wave. The header must have a known version
+    number. Its checksum must be correct, except in version 5, where it is not tested.
     """
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
