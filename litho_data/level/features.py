@@ -1,5 +1,5 @@
-"""Mark features, such as particles or structures, and level a scan with a background that is not fitted to
-the features.
+"""Mark features, such as particles or structures, and level a scan by a background that is fitted only to the
+pixels outside the features.
 """
 
 from typing import Annotated, Literal

@@ -63,9 +63,9 @@ def level_layout_aware(
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
-        InputError: the degrees allow only a constant background; or the layout has another shape than the
-            scan, does not overlap with the scan, or has the same form as the background (such as a ramp), so
-            that the two cannot be separated.
+        InputError: the degrees allow only a constant background; the layout has another shape than the scan
+            or does not overlap with it; or the layout cannot be separated from the background, because both
+            have the same form, such as a ramp.
     """
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)

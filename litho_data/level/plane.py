@@ -37,10 +37,10 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
     """Subtract the tilt of the prevailing facet. The height at the pivot (column nx/2, row ny/2) does not
     change.
 
-    The function ``prevailing_slope`` finds the tilt iteratively from the slopes v of all 2 x 2 cells whose
-    four pixels are selected. The weights are exp(-|v|² / s²) with s² = mean |v|² / 20. The iteration ends
-    when the slope changes by less than sqrt(1e-9), as in Gwyddion 2.62. (Gwyddion 2.45 uses the limit
-    sqrt(1e-8), which changes the result by 2e-3 of the height range.)
+    The function ``prevailing_slope`` finds the tilt in several passes, from the slopes v of all 2 x 2 cells
+    whose four pixels are selected. Each pass averages the slopes with the weights exp(-|v|² / s²), where s² =
+    mean |v|² / 20. The passes end when the tilt changes by less than sqrt(1e-9), as in Gwyddion 2.62.
+    (Gwyddion 2.45 uses the limit sqrt(1e-8), which changes the result by 2e-3 of the height range.)
 
     Args:
         z: heights in µm, shape (ny, nx). Slopes are computed as height / length, so heights and pitch must

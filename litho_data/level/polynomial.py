@@ -41,7 +41,8 @@ def level_polynomial(
 
     The mean of the fitted pixels becomes zero. Without ``total_degree``, the terms are x^p y^q with p <=
     x_degree and q <= y_degree (Gwyddion's independent degrees). With ``total_degree``, the terms are those
-    with p + q <= total_degree (Gwyddion's limited total degree), and the other two degrees are ignored.
+    with p + q <= total_degree (Gwyddion's limited total degree), and ``x_degree`` and ``y_degree`` are
+    ignored.
 
     Args:
         z: heights in any unit, shape (ny, nx).

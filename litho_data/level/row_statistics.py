@@ -34,11 +34,12 @@ def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
 
 
 def row_modus(values: Array, chosen: Array) -> Array:
-    """Return the modus of each row: the mean of the middle third of the shortest window of the row's values.
+    """Return the modus of each row, which is an estimate of the most frequent of its values.
 
-    The n selected values are sorted, and a window contains round(sqrt n) consecutive sorted values. Its
-    length is the difference between its last and its first value. With fewer than 9 values, the result is the
-    upper median; without selected values, it is 0.
+    The n selected values of a row are sorted. A window contains round(sqrt n) consecutive sorted values, and
+    its length is the difference between its last and its first value. The modus is the mean of the middle
+    third of the shortest window. For a row with fewer than 9 selected values, the result is the upper median.
+    It is 0 for a row without selected values.
 
     If heights have few digits, several windows often have the same length, and rounding errors would decide
     which is the shortest. Gwyddion compares the lengths in metres. This function therefore converts the

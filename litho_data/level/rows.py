@@ -51,8 +51,8 @@ def align_rows(
     Args:
         z: heights in µm, shape (ny, nx). The results of the methods ``"matching"`` and ``"modus"`` depend on
             the unit. These methods therefore convert the heights from µm to metres, the unit that Gwyddion
-            uses. In ``"matching"``, the weights depend on the ratio of a squared height to a height. In
-            ``"modus"``, rounding errors decide between windows of equal length.
+            uses. In ``"matching"``, the weights contain a squared height divided by a height, and this ratio
+            depends on the unit. In ``"modus"``, rounding errors decide between windows of equal length.
         method: ``median``, ``trimmed-mean`` and ``modus`` shift each row so that the median, trimmed mean or
             modus is the same for all rows. The two ``-of-differences`` methods and ``matching`` estimate the
             step between each pair of neighbouring rows and add up these steps, which preserves large

@@ -99,8 +99,8 @@ def write_heights(
 ) -> Path:
     """Write a height map in the format that the file's suffix names.
 
-    A ``.gsf`` file contains float32 metres with size and title, and opens in Gwyddion. A ``.npy`` file
-    contains only the heights, as float64 in µm. Missing pixels are NaN in both.
+    A ``.gsf`` file contains the heights in metres as float32, the size of the scan and the title. Gwyddion
+    can open it. A ``.npy`` file contains only the heights, as float64 in µm. Missing pixels are NaN in both.
 
     Raises:
         InputError: the file has another suffix.

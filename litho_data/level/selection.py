@@ -13,8 +13,9 @@ class Levelled(NamedTuple):
     """A levelled height map and the surface that levelling removed; ``height + removed`` is the input.
 
     Both maps are float64 arrays of shape (ny, nx) in the unit of the input. Pixels that are NaN in the input
-    are NaN in ``height``. ``removed`` of a single operation has no NaN. It may be a read-only view if it is
-    constant along an axis. ``removed`` of a recipe is NaN where ``height`` is NaN.
+    are NaN in ``height``. If a single operation made the result, ``removed`` has no NaN, and may be a
+    read-only view if it is constant along an axis. If a recipe made it, ``removed`` is NaN where ``height``
+    is NaN.
     """
 
     height: Array

@@ -34,8 +34,8 @@ class CoarseFit:
 
     ``layout_to_oriented`` is a 3×3 matrix. It maps pixel indices of the layout to pixel indices of the
     oriented scan, ``orient(scan, orientation) * polarity``. ``points`` contains the matched keypoints. If
-    keypoints were not used, or too few of them match, ``points`` is None and the matrix is the shift with the
-    highest correlation.
+    keypoints were not used, or too few of them match, ``points`` is None. The matrix then contains only a
+    shift, the one with the highest correlation.
     """
 
     orientation: str
@@ -79,8 +79,8 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """Return the best hypothesis. On a symmetric layout, several hypotheses fit about equally well. If the
-    upright hypothesis is among them, return it instead.
+    """Return the best hypothesis, or the upright one (not rotated, mirrored or inverted) if it correlates
+    well and nearly as well as the best. On a symmetric layout, several hypotheses fit about equally well.
     """
     best = hypotheses[0]
     for hypothesis in hypotheses:

@@ -51,11 +51,11 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: the result of ``refine_pyramid``. The refinement starts at a quarter of the resolution. The
-            position error of this warp may therefore be as large as the width of the printed structures at
-            that resolution.
-        curve: the distortion to fit. ``quadratic`` stands for a bend. The number of the oriented scan's slow
-            axis (0 = x, 1 = y) stands for creep. The slow axis runs across the scan lines.
+        straight: the result of ``refine_pyramid``, from which the refinement starts at a quarter of the
+            resolution. The position error of this result may therefore be as large as the width of the
+            printed structures at a quarter of the resolution.
+        curve: the distortion to fit: ``quadratic`` for a bend. For creep, it is the number (0 = x, 1 = y) of
+            the oriented scan's slow axis, which runs across the scan lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -129,9 +129,9 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # The gain of a block is the decrease of its squared misfit when creep is added to the warp. Creep fades
-    # along the scan, so the gain is large in only a few blocks. A rank test is used because it does not
-    # depend on how large these gains are.
+    # The squared misfit of each block is compared with and without creep in the warp. Creep fades along the
+    # scan, so the misfit decreases strongly in only a few blocks. A rank test is used because it does not
+    # depend on how strong these decreases are.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 

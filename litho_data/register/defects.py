@@ -98,9 +98,9 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
 
     The misfit is the height of the scan, on the layout's pixels, minus a prediction. The prediction is the
     sum of a piecewise linear function of the predicted topography (with 8 knots) and a quadratic background.
-    Both are fitted with Tukey's weights. Sigma is the robust standard deviation of the misfit. A connected
-    area is found if it has at least 30 pixels and its misfit exceeds 3 sigma everywhere and 8 sigma
-    somewhere. If such areas cover more than 45 % of the field, none is found.
+    Both are fitted with Tukey's weights. Sigma is the robust standard deviation of the misfit. The function
+    finds every connected area of at least 30 pixels in which the misfit exceeds 3 sigma everywhere and 8
+    sigma somewhere. If such areas cover more than 45 % of the field, none of them is returned.
 
     Args:
         scan: smoothed heights with shape (ny, nx), in the same frame as ``fine.scan``. Heights at defects are

@@ -44,23 +44,23 @@ class BlockShifts:
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Average the shifts of all blocks that have the same position along an axis. Return the largest
-        minus the smallest mean, or NaN if there are fewer than three positions.
+        """Average the shifts of all blocks that have the same position along the axis ``along``. Return the
+        largest of these means minus the smallest, or NaN if there are fewer than three positions.
 
         Args:
-            axis: the axis of the shifts (0 = x, 1 = y).
-            along: the axis along which the positions are taken.
+            axis: the component of the shifts that is averaged (0 = x, 1 = y).
+            along: the axis along which the blocks are grouped by position (0 = x, 1 = y).
 
         If the scanner is linear and the kind of warp is general enough, the shifts vary only by noise. A
-        larger variation means that an axis of the scanner is not linear or that the scanner creeps. No warp
-        of ``LADDER`` describes these two effects.
+        larger variation means that an axis of the scanner is not linear or that the scanner creeps. Neither
+        effect can be described by any of the kinds of warp in ``LADDER`` (translation to homography).
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Return whether the mean shift of the blocks depends on the position along this axis. The means must
-        differ by a relevant amount, and by clearly more than their standard errors.
+        """Return whether the mean shift of the blocks depends on the position along this axis. The result is
+        true only if the means differ by a relevant amount, and by clearly more than their standard errors.
         """
         for axis in (0, 1):
             groups = self._by_place(axis, along)
@@ -145,7 +145,8 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 
 
 def height_correlation(height: Array, layout_level: Array) -> float:
-    """Return the Pearson correlation of the layout with the heights, which are smoothed with sigma = 1 px.
+    """Smooth the heights by a Gaussian with sigma = 1 px, and return their Pearson correlation with the
+    layout.
 
     Layout and heights have shape (ny, nx), and heights may be NaN. Only pixels that have a known height and
     do not lie in the border of the layout (see ``interior_of``) are used.
@@ -158,7 +159,7 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 def _peak(score: Array) -> Array:
     """Return the position (x, y) of the largest score. Along each axis, the position is refined to a fraction
-    of a pixel, unless it lies at the border.
+    of a pixel if it does not lie at the border.
     """
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)

@@ -1,7 +1,8 @@
-"""Define the generators of every kind of warp, and compute the velocities (flows) of points under a
-generator.
+"""Define the kinds of warp by their generators. A generator is a 3×3 matrix that describes one way in which a
+warp can change, such as a shift, a rotation or a change of scale. If the warp changes in this way, every
+point moves. The module computes the velocities (flows) of the points.
 
-The kinds of warp form a ladder: each kind contains all kinds before it.
+The kinds of warp form a ladder, in which each kind contains all simpler kinds.
 """
 
 from collections.abc import Iterator

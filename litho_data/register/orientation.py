@@ -138,9 +138,9 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
 
 
 def _correlations(fixed: Array, moving: Iterable[Array]) -> Iterator[tuple[Array, Array]]:
-    """Yield ``masked_correlation(fixed, one)`` for each of several images. Some terms depend only on the
-    fixed image and the mask of the other image. They are computed once for all images with the same shape and
-    mask.
+    """For each of the images in ``moving``, yield its ``masked_correlation`` with ``fixed``. Some terms
+    depend only on the fixed image and the mask of the other image. They are computed once for all images with
+    the same shape and mask.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 

@@ -38,8 +38,8 @@ class Refinement:
 
     The field is divided into cells with sides of about ``CELL_PX`` pixels. For every cell, ``gram`` contains
     the matrix of inner products of the regressors with each other and with the scan. Its shape is (cells_y,
-    cells_x, k, k). The order is: the regressor of the gain, the regressors of the background, the regressors
-    of the warp, and last the scan. These sums suffice to fit the warp again to any part of the field.
+    cells_x, k, k). The regressors are those of the gain, of the background and of the warp, in this order.
+    The scan comes last. These sums suffice to fit the warp again to any part of the field.
     """
 
     model: Model
@@ -141,8 +141,8 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
     Args:
         aligned: the scan on the layout's pixels, shape (ny, nx), NaN where not measured.
         topography: topography predicted from the layout, shape (ny, nx).
-        count: number of generators of the warp, from ``LADDER`` or ``BENT_COUNT``.
-        further: regressors in addition to those of ``Refinement``, each of shape (ny, nx).
+        count: number of generators of the warp: a value of ``LADDER``, or ``BENT_COUNT``.
+        further: additional regressors, each of shape (ny, nx).
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)

@@ -45,8 +45,8 @@ def resample_to_layout(
     Returns:
         ``height_um``, the heights in µm as float32, NaN where not valid; and ``valid``, a bool mask. Both
         have the shape ``layout_shape``. A pixel is valid if it lies between pixel centres of the scan, and if
-        no missing pixel of the scan lies within two scan pixels of it. The kernel of the spline reaches as
-        far as two pixels.
+        no missing pixel of the scan lies within two scan pixels of it, which is the reach of the spline's
+        kernel.
 
     Raises:
         InputError: ``scan_to_layout`` is not an invertible 3×3 matrix, or the scan has no measured pixel.

@@ -1,9 +1,9 @@
 """Estimate the quadratic surface that the heights of a registered scan contain in addition to the print, and
 the error of the registration's warp.
 
-Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
-Some structure in the heights does not follow from the layout and causes errors of the fits. If this structure
-differs from block to block, the spread of the fits includes these errors.
+Gain, quadratic surface and warp are fitted many times. Each time, another block of the field is left out
+(jackknife). Some structure in the heights does not follow from the layout and causes errors of the fits. If
+this structure differs from block to block, the spread of the fits includes these errors.
 """
 
 from dataclasses import dataclass
