@@ -26,8 +26,9 @@ def scan_surface(
     """Return the heights, in µm, that the microscope reports for a surface.
 
     The fast axis is x, and the top line is scanned first. Lines run from left to right in trace, and from
-    right to left in retrace. The tip spends the same time on every pixel, whether the pixel is large or
-    small. The feedback lags by a fixed time, which is a shorter distance if the pixels are smaller.
+    right to left in retrace. The tip spends the same time on every pixel, so it moves more slowly over small
+    pixels. The feedback lags by a fixed time. If the pixels are smaller, the tip moves a shorter distance
+    during this time.
 
     Args:
         surface_um: true heights at the pixels of the scan, in µm.
@@ -65,8 +66,9 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Return the heights at which a tip shaped like a paraboloid touches the surface h: ``max_u h(x − u) −
-    u²/2R``, where the radii R along y and x are ``radii_um``.
+    """Return the heights at which a tip shaped like a paraboloid touches the surface h. Along each axis, they
+    are the maximum of ``h(x − u) − u²/2R`` over all distances u from the axis of the tip. ``radii_um``
+    contains the radii R along y and x.
 
     The tip may touch the surface between two pixels.
     """

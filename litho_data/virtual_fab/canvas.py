@@ -1,5 +1,6 @@
-"""Define the canvas, which is the area that is simulated: a layout and a guard frame around it. The module
-also blurs arrays on the canvas, by multiplying their spectra.
+"""Define the canvas, i.e. the area that is simulated. It consists of a layout and a guard frame, which is a
+margin of ``GUARD_PX`` pixels on each side. The module also blurs arrays on the canvas, by multiplying their
+spectra.
 """
 
 from dataclasses import dataclass

@@ -87,8 +87,8 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Return the nominal dose of hatch lines with position errors. The dose that the layout places at x is
-    written at x + strength·x(1 − x/L).
+    """Return the nominal dose if positions along the hatch lines have an error. The dose that the layout
+    places at x is written at x + strength·x(1 − x/L).
 
     The coordinate x runs from 0 to L, where L is the side of the write field.
     """

@@ -275,8 +275,8 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
     """Return a random layout with the levels 0 and 1, a uint8 array of the given shape (ny, nx). The layout
     has a rim of level 0. Its features are large enough for the process to resolve.
 
-    A larger value of ``finer`` makes the features smaller. The films of a run use the values 0, 1 and 2 in
-    turn.
+    A larger value of ``finer`` makes the features smaller. Successive films of a run use the values 0, 1, 2,
+    0, 1, 2 and so on.
     """
     cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
     inner = tuple(length - 2 * _RIM_PX for length in shape)

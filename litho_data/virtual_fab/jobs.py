@@ -22,7 +22,7 @@ from litho_data.virtual_fab.settings import Printer
 SCANNING = ("turned_deg", "direction", "tip", "pixel_size")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
-# Cut-off frequencies of the random layouts, in cycles/µm. Successive prints use them in turn.
+# Cut-off frequencies of the random layouts, in cycles/µm. Successive prints use the two values alternately.
 _CUTOFFS_PER_UM = (0.25, 0.5)
 
 
@@ -128,8 +128,8 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     """Make the jobs that print and scan the layouts of a dataset card.
 
     The columns ``turned_deg``, ``direction``, ``tip`` and ``pixel_size`` of the card's table may state how
-    each scan is made. With these columns, rows with the same print and the same layout are scans of one
-    printed field.
+    each scan is made. If the table has these columns, rows with the same print and the same layout are scans
+    of one printed field.
 
     Args:
         path: path of the card.

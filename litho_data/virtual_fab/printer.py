@@ -82,18 +82,20 @@ class Cause:
     """
 
     def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
-        """Return the changed two-photon dose on the canvas. The full dose is 1, and no dose may be
-        negative.
+        """Return the two-photon dose on the canvas after the effect has changed it. The full dose is 1, and
+        no dose may be negative.
         """
         return dose
 
     def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
-        """Return the changed heights of the dried surface without roughness, on the canvas, in µm."""
+        """Return the heights of the dried surface without roughness after the effect has changed them, on the
+        canvas, in µm.
+        """
         return surface_um
 
     def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
-        """Return the changed true heights at the pixels of the scan, in µm, before the microscope adds its
-        errors.
+        """Return the true heights at the pixels of the scan after the effect has changed them, in µm. The
+        microscope adds its errors later.
         """
         return height_um
 

@@ -72,7 +72,9 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
 
 
 def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the heights after the shrinkage that knobs cause. Plain drying has already shrunk ``height``."""
+    """Return the heights after the shrinkage that knobs cause. ``height`` already includes the shrinkage of
+    plain drying.
+    """
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
     if strength := knobs["dose-dependent-shrinkage"]:
@@ -89,8 +91,8 @@ def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, 
 
 
 def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Return the heights after development. Capillary forces and the developer change narrow features and
-    steep flanks, as far as the knobs state.
+    """Return the heights after development. The knobs state how strongly capillary forces and the developer
+    change narrow features and steep flanks.
     """
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:

@@ -210,8 +210,9 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]], sizes_um: list[YX]) -> None:
-    """Write the card's table. If all scans have the usual values in the columns SCANNING, these columns are
-    left out. If all scans have the same size (y, x), the sizes are left out.
+    """Write the card's table. The columns ``SCANNING`` are left out if every scan was made in the usual way,
+    i.e. has the values ``AS_EVER`` in these columns. The sizes (y, x) are left out if all scans have the same
+    size.
     """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)

@@ -23,7 +23,7 @@ _MAX_STEPS = 40
 
 @dataclass(frozen=True)
 class KnobStrength:
-    """A setting of a knob, and the rms change of the scans in nm that it causes.
+    """A setting of a knob, and the rms change, in nm, that it causes in the scans.
 
     If the requested change exceeds the change at the knob's largest strength, the setting has the largest
     strength, and ``rms_nm`` is smaller than requested.
