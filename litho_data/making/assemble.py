@@ -34,9 +34,9 @@ class Source:
     ``files`` contains, for each id, a mapping from the recorded names of its raw files to their paths. A
     recorded name is the path below the data folder. ``standards`` maps the recorded names of the calibration
     standards' raw files to their paths. ``recipe`` is the levelling recipe in canonical form. ``assumptions``
-    lists the assumptions that were made because the card does not state a value. ``unpaired`` maps every id
-    that lacks a scan or a layout to the reason, and ``refused`` maps every id with an unusable file to the
-    reason.
+    lists the assumptions that were made because the card does not state a value. Two mappings contain the
+    reasons why ids are left out, keyed by id: ``unpaired`` for ids without a complete pair of scan and
+    layout, and ``refused`` for ids with an unusable file.
     """
 
     card: Card

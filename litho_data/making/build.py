@@ -62,13 +62,13 @@ def build_dataset(
         workers: number of local processes.
         dask: address of a Dask scheduler, which is used in place of local processes. The store is the same
             either way.
-        strict: if true, nothing is built unless every id has a scan and a layout that can be used.
+        strict: if true, a store is built only if every id has a scan and a layout that can be used.
         seed: seed of the robust estimator in the registration.
         tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans. It replaces the
             value in the card. Pixels that the tip possibly did not touch become invalid.
 
     Raises:
-        InputError: the card is bad, no scan is usable, ``tip`` is neither a radius nor ``blind``, or ``out``
+        InputError: the card is bad, no scan is usable, ``tip`` is not a radius or ``blind``, or ``out``
             contains something other than a store. With ``strict``, the error is also raised if any id lacks a
             usable scan or a usable layout.
     """
@@ -204,8 +204,8 @@ def _relative(folder: Path, start: Path) -> str:
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
     """Test whether any scan that could not be registered shows the layout of another id. If it does, the id
-    of this layout is added to the scan's reason in ``skipped``. The result maps the ids of such scans to
-    messages that name the layout.
+    of this layout is added to the reason that ``skipped`` gives for the scan. The result maps the ids of such
+    scans to messages that name the layout.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}

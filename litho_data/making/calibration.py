@@ -114,8 +114,8 @@ def standards_of(listing: Listing) -> Standards:
 
 def defaults_beside(own: Collection[str]) -> list[str]:
     """Return those of the arguments ``unit`` and ``size_um`` of ``read_scan`` that the card states only for
-    all scans together. If the file of a scan states another value for one of these arguments, the file takes
-    precedence.
+    all scans together. For these arguments, the value in the file of a scan takes precedence over the value
+    in the card.
 
     ``own`` contains the names of the arguments that the card or its table states for this scan alone. The
     file of the scan must agree with their values, so these names are not returned.

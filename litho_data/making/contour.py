@@ -36,8 +36,8 @@ class Edges(NamedTuple):
 
     ``distance_px`` has the shape (ny, nx) of the micrograph. It contains the signed distance of each pixel
     from the nearest edge, positive on the film. ``specks`` is a bool mask of the same shape. It marks dots
-    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of the edge
-    position if it is determined from a single pixel.
+    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of an edge
+    position that is determined from a single pixel.
     """
 
     distance_px: Array
@@ -112,8 +112,8 @@ def edge_shift_px(level: Array, distance_px: Array) -> float:
     """Return the median distance, in pixels, by which the edges of a film lie outside the edges of its
     layout. The result is negative if the film's edges lie inside.
 
-    In a layout of small islands and gaps, a registration would mistake part of such a shift for a change of
-    scale. The registration must therefore use a layout whose edges are shifted in the same way. A shift of
+    If a layout consists of small islands and gaps, the registration would mistake part of such a shift for a
+    change of scale. It must therefore use a layout whose edges are shifted by the same distance. A shift of
     less than one pixel is negligible, and the result is then 0. It is also 0 if the film or the layout has no
     edges.
 

@@ -29,9 +29,8 @@ def height_sigma(
 
     The variance is the sum of six parts, each with its own cause:
 
-    - ``pixel``: noise that is independent from pixel to pixel, as far as it remains after resampling;
-    - ``line``: offsets that are independent from scan line to scan line, as far as they remain after
-      resampling;
+    - ``pixel``: what resampling leaves of the noise that is independent from pixel to pixel;
+    - ``line``: what resampling leaves of the offsets that are independent from scan line to scan line;
     - ``resampling``: the fine structure of the print that interpolation loses;
     - ``registration``: the uncertainty of the warp, multiplied by the slope of the heights;
     - ``levelling``: the tilt and bow that levelling left in the heights, or wrongly removed from the print;

@@ -200,10 +200,9 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """Return the parameters that describe the grid of the layout. If the card states that the
-        surroundings of the field are unknown or belong to the print, the heights at the border depend on
-        surroundings that the layout does not show. They become invalid, and ``edge_px`` is the width of this
-        border in pixels.
+        """Return the parameters that describe the grid of the layout. The heights at its border depend on
+        what surrounds the field. If the card states that the surroundings belong to the print or are unknown,
+        the layout does not show them. A border of ``edge_px`` pixels then becomes invalid.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)

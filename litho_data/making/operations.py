@@ -128,7 +128,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the edges of the film, and make a height map from them, which another operation registers."""
+    """Find the edges of the film, and make a height map from them. Another operation registers this map."""
     from litho_data.making.contour import REACH_PX, coverage, find_edges
 
     edges = find_edges(arrays["micrograph"], params.get("reach_px", REACH_PX))
@@ -159,8 +159,9 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     covered = coverage(np.where(valid, distance, np.nan), pitch_um)
     dirt = foreign(covered, level / params["full_level"], params["dirt_px"])
     if shift_px := edge_shift_px(level, np.where(valid, distance / pitch_um, np.nan)):
-        # If the edges moved farther than `dirt_px`, whole edges are marked as dirt. Therefore, only pixels
-        # that are also marked relative to the moved edges count as dirt.
+        # If the edges of the film are shifted by more than `dirt_px`, a comparison with the layout marks
+        # whole edges as dirt. Pixels therefore count as dirt only if a comparison with the shifted layout
+        # marks them too.
         moved = with_moved_edges(level, shift_px) / params["full_level"]
         dirt &= foreign(covered, moved, params["dirt_px"])
     valid &= ~dirt

@@ -250,11 +250,12 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
     """Return messages for the doses that seem to be swapped, keyed by dose. Doses seem to be swapped if the
-    height per level clearly falls from a smaller to a larger dose. If it falls nowhere, the result is empty.
+    height per level is clearly smaller at a larger dose. If this is the case for no pair of doses, the result
+    is empty.
 
     Args:
-        rising: for each dose, the median logarithm of the height per level and the number of scans. It
-            contains only doses at which the height grows with the dose.
+        rising: for each dose, the median logarithm of the height per level and the number of scans. Doses are
+            left out if, according to the shape of their prints, the height does not grow with the dose.
         scatter: standard deviation, from scan to scan, of the logarithm of the height per level at one dose.
     """
     doses = sorted(rising)
@@ -263,8 +264,8 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     falls = values[:, None] - values - _CLEAR_SIGMA * np.hypot.outer(error, error)
     if not (np.triu(falls, 1) > 0).any():
         return {}
-    # The values should rise with the dose. Therefore, the rank of a value among the values is the position of
-    # its true dose among the doses.
+    # The height per level should rise with the dose. The k-th smallest height per level therefore belongs to
+    # the k-th smallest dose.
     pairs = {k: sorted((k, int(rank))) for k, rank in enumerate(np.argsort(np.argsort(values)))}
     return {
         doses[k]: f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"

@@ -87,10 +87,10 @@ def suggest_recipe(
 
     The field is divided into blocks of 16 px. In half of the blocks, a piecewise linear function of the
     blurred level is fitted to the levelled heights. The recipes are compared by the residual of this fit in
-    the other half. This residual contains both the tilt that a recipe fails to remove and the part of the
-    print that the recipe wrongly removes. A recipe is not suggested if it cannot be applied to one of the
-    scans, or if one of its steps gives a warning. For example, the alignment of rows warns if it shifts lines
-    that probably had no offset.
+    the other half of the blocks. This residual contains both the tilt that a recipe fails to remove and the
+    part of the print that the recipe wrongly removes. A recipe is not suggested if it cannot be applied to
+    one of the scans, or if one of its steps gives a warning. For example, the alignment of rows warns if it
+    shifts lines that probably had no offset.
 
     Args:
         card_path: path of the card. ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside
@@ -100,8 +100,8 @@ def suggest_recipe(
 
     Raises:
         InputError: the card is bad or describes micrographs, no scan can be read and registered, every recipe
-            gives a warning or cannot be applied, or the name of the best recipe cannot be added to the card
-            as a line.
+            gives a warning or cannot be applied, or the card is written in a form to which the line with the
+            name of the best recipe cannot be added.
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
@@ -179,7 +179,7 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
     """Return the root mean square, in µm, of the part of the heights that the layout does not explain.
 
     A piecewise linear function of the blurred level is fitted to the heights in half of the blocks of the
-    field. The result is computed from the residuals of this fit in the other half.
+    field. The result is computed from the residuals of this fit in the other half of the blocks.
 
     Args:
         height_um: levelled heights in µm, shape (ny, nx), NaN where not measured.
@@ -201,8 +201,8 @@ def _write_card(card: Path, best: str) -> Path:
     of the card stays unchanged. Return the path of the copy.
 
     Raises:
-        InputError: the recipe's name cannot be added to the card as a line, for example because the table
-            ``process`` is written on one line.
+        InputError: the line with the recipe's name cannot be added to the card, for example because the
+            card's table ``process`` is written on one line.
     """
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
     before = card.read_text(encoding="utf-8")
