@@ -1,5 +1,4 @@
-"""Rules for commands that write their result as a folder. The rules state how a command declares, begins,
-continues and finishes this result.
+"""Begin, continue and finish results that commands write as folders.
 
 A command first declares two things: the name of its record file, which it writes last, and the fields of
 this record that determine the result. The folder is then in one of four states:
@@ -50,8 +49,8 @@ def growing_folder(
 ) -> Iterator[Begun]:
     """Yield a folder to which the files of a result are added one by one, so that a stopped run can resume.
 
-    If the folder already contains this result, its other files are left alone. Only one process at a time may
-    write the folder.
+    If the folder already contains this result, files that do not belong to the result are left alone. Only
+    one process at a time may write the folder.
 
     Args:
         out: the folder; it is created if it is missing.
@@ -64,8 +63,9 @@ def growing_folder(
 
     Raises:
         InputError: ``out`` is a file, cannot be written, or is being written by another process. The error is
-            also raised if ``out`` contains something other than this result, such as a result of this kind
-            with other ``facts``. All these errors are raised before the ``with`` block begins.
+            also raised if ``out`` contains something other than this result, for example a result of the same
+            command with other settings in ``facts``. All these errors are raised before the ``with`` block
+            begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)

@@ -21,8 +21,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
     Args:
         path: where the result will be.
-        holds: paths, or patterns of paths such as ``layouts/*.tif``, of all files that such a result may
-            contain, relative to the folder. If a path names a subfolder, this subfolder may contain anything.
+        holds: paths relative to the folder, or patterns of such paths (``layouts/*.tif``), of all files that
+            a result may contain. If a path names a subfolder, this subfolder may contain anything.
 
     Raises:
         InputError: the path is the current folder or a file, or the folder contains a file that does not
@@ -74,8 +74,8 @@ def first_difference(then: Facts, now: Facts, *above: str) -> str:
 
     Args:
         then, now: the older and the requested settings.
-        above: keys, from the outermost to the innermost, under which ``then`` and ``now`` are found in the
-            whole record.
+        above: if ``then`` and ``now`` are parts of whole records, the keys that lead to these parts, from the
+            outermost to the innermost. For whole records, no keys are given.
     """
     path = "".join(f"{key}." for key in above)
     for name, after in now.items():

@@ -1,5 +1,5 @@
-"""Refer to scans of a store by their ids. Only this reference, and not the arrays, is sent to other
-processes. These processes read the scans from the store.
+"""Make references to scans of a store. Only such a reference, and not the arrays of the scans, is sent to
+other processes. These processes read the scans from the store.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def _may_be_left_out(name: str, document: Facts) -> bool:
 
     When xarray copies a store, it writes no groups, and no chunks that contain only fill values. The chunk of
     an optional column contains only fill values if no scan of the copy has a value. The chunk of the column
-    ``order`` does so if the copy has a single scan, of order 0.
+    ``order`` contains only fill values if the copy has a single scan, whose order is 0.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
@@ -186,8 +186,8 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copied store if rows or columns of pixels were reordered, or if any were removed that are not
-    at the end. The coordinates of the pixels show such changes.
+    """Refuse a copied store if its rows or columns of pixels were reordered, or if rows or columns other than
+    the last ones were removed. The coordinates of the pixels show such changes.
 
     Positions in the store, such as the transforms of the scans, are relative to the first pixel. A copy may
     therefore leave out only the last rows and columns.

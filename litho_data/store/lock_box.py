@@ -1,8 +1,8 @@
 """Choose the lock box of a dataset. The lock box contains scans that are set aside for the final test. They
 must not influence any choice of a model or an effect.
 
-The draw uses hashes of the ids and prints, and no random generator of a library. The same dataset therefore
-always has the same lock box.
+The scans are selected by hashes of the ids and prints, and not by the random generator of a library. The same
+dataset therefore always has the same lock box.
 """
 
 import hashlib
@@ -60,8 +60,8 @@ def field_sha256(print_id: str, mask_level: Array, stated: Sequence[float | None
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str], fields: Sequence[str]) -> list[str]:
-    """Return the ids of the scans in the lock box. A sixth of the printed fields, and at least one, are
-    locked, if possible from different prints. The lock box contains all scans of these fields.
+    """Return the ids of the scans in the lock box. A sixth of the printed fields, but at least one field, is
+    drawn, from different prints if possible. The lock box contains all scans of the drawn fields.
 
     If the dataset has only one or two fields, the lock box is empty.
 

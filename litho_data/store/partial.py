@@ -89,8 +89,8 @@ class PartialStore:
         return root
 
     def finished(self, root: zarr.Group, keys: Facts) -> dict[str, dict[str, Any]]:
-        """Remove the scans that must be computed again. Return the records of the other finished scans, keyed
-        by id.
+        """Keep the finished scans that can be reused, and remove all others. Return the records of the scans
+        that are kept, keyed by id.
 
         Args:
             root: the root group to which scans are added.

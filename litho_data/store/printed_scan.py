@@ -34,9 +34,9 @@ class PrintedScan:
             the card has no such table.
         field_x_um, field_y_um: position of the scan in its write field, µm. ``dose`` is the relative dose.
             None means that the card does not state the value.
-        turned_deg: rotation of the scan relative to the other scans. ``direction`` is 1 for trace and -1 for
-            retrace, ``tip`` is the number of the tip, and ``pixel_size`` is the pixel size relative to the
-            other scans. None means that the card does not state the value.
+        turned_deg: rotation of the print under the microscope. ``direction`` is 1 for trace and -1 for
+            retrace, ``tip`` is the number of the tip, and ``pixel_size`` is the pixel size relative to that
+            of the other scans. None means that the card does not state the value.
         bend_um: bend of the scan; None if the scan is not bent. For a bent scan, ``scan_to_layout`` applies
             to positions from which the bend has been removed.
         tip_radius_um: radius of the microscope's tip, or an upper bound for it; None if the store has

@@ -197,7 +197,7 @@ class Store:
     @cached_property
     def locked_ids(self) -> list[str]:
         """Return the ids of the scans in the lock box, which are set aside for the final test. The lock box
-        consists of all scans of a sixth of the printed fields. For the same dataset, it is always the same.
+        consists of all scans of a sixth of the printed fields. The same dataset always has the same lock box.
         """
         fields = [
             field_sha256(
@@ -301,7 +301,7 @@ class Store:
         return {**identity, "arrays": hashes}
 
     def _bend_um(self, row: int) -> Bend | None:
-        """Return the bend of a scan's lines, in the scan's own frame, or None if the store contains none."""
+        """Return the bend of a scan, in the scan's own frame, or None if the store contains none."""
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None

@@ -44,7 +44,7 @@ def write_scan_group(
         scan_id: name of the scan.
         arrays: arrays of the scan, keyed by name. Those that are not listed in ``SCAN_VARIABLES`` are
             ignored.
-        use: use of the scan, as in the card's table.
+        use: purpose of the scan, as in the column ``use`` of the card's table.
         pitch_um: pixel pitch of the scan along y and x, µm.
     """
     shown = next(name for name in SHOWN if name in arrays)
@@ -127,9 +127,9 @@ def write_table(
 ) -> None:
     """Write a table as a group of one-dimensional arrays over ``dim``; all strings are encoded in UTF-8.
 
-    For each type of column, one array is created in memory. Each column is written to the array of its type,
-    and the files of this array are then copied to the store. To create one array per column would take three
-    times as long.
+    All columns of the same type share one array in memory, because creating an array for each column would
+    take three times as long. The columns are written to this array one after another. After each column, the
+    files of the array are copied to the store.
     """
     import zarr
     from zarr.storage import MemoryStore
