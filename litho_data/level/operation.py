@@ -72,10 +72,11 @@ def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Return a decorator that registers a function as the operation named ``op`` of levelling recipes.
 
     The function receives two arrays of shape (ny, nx): the heights (float64), and a bool array that is True
-    at the usable pixels. Callers of the decorated function instead pass a height map of any numeric type, a
-    ``mask`` and a ``masking``, from which ``select`` determines the usable pixels. The keyword arguments of
-    the function, except those whose values come with the scan, become fields of the step and are checked at
-    every call. The function returns a ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
+    at the usable pixels. The decorated function, in contrast, is called with a height map of any numeric
+    type, a ``mask`` and a ``masking``. From these, ``select`` determines the usable pixels. The keyword
+    arguments of the function, except those whose values come with the scan, become fields of the step and are
+    checked at every call. The function returns a ``Levelled``, a ``MaskedLevelling``, or a bool array of
+    pixels to mark.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:

@@ -128,9 +128,10 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
     P_p(x) of Legendre polynomials.
 
     Column j has the coordinate x = 2 j / (nx - 1) - 1, which runs from -1 to 1. The y coordinates of rows are
-    defined in the same way. Legendre polynomials make the fit far better conditioned than powers. Both span
-    the same polynomials if, for each term in ``terms``, all terms of lower degrees are included as well. The
-    sums over the pixels separate into x and y, so the fit costs only a few products of thin matrices.
+    defined in the same way. With Legendre polynomials, the fit is far better conditioned than with powers.
+    Both span the same polynomials if, for each term in ``terms``, all terms of lower degrees are included as
+    well. The sums over the pixels separate into x and y, so the fit costs only a few products of thin
+    matrices.
 
     Args:
         z: heights, shape (ny, nx); NaN only where the weight is zero.

@@ -1,5 +1,5 @@
 """Read HDF5 files. Files of JPK (series), Nanosurf (NHF), TopoStats and Zygo (DATX) are read by the
-conventions of these programs. Files of all other programs are read as self-describing arrays.
+conventions of these makers and programs. All other files are read as self-describing arrays.
 """
 
 from functools import partial

@@ -59,8 +59,8 @@ class Block:
     """A block of consecutive lines of numbers, with the header that stands above it.
 
     ``header`` maps the keys in the header's lines to their values, and ``words`` contains these lines
-    unchanged. ``rows`` contains the lines of numbers as text. ``first_line`` is the number of the line in the
-    file that contains the first row.
+    unchanged. ``rows`` contains the lines of numbers as text. ``first_line`` states in which line of the file
+    the first row stands.
     """
 
     header: dict[str, str]

@@ -172,7 +172,7 @@ def fit_bent_affine(
 
     Raises:
         numpy.linalg.LinAlgError: the points do not determine all coefficients, because they are too few or
-            lie on a conic section, such as a line; or the images lie on a line.
+            lie on a conic section, such as a line; or the positions in ``images`` lie on a line.
     """
     u, v = ((points - middle) / half).T
     basis = np.stack([np.ones_like(u), u, v, *_terms(u, v, degree)], axis=1)

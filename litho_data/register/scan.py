@@ -86,10 +86,10 @@ def register_scan(
         layout_level: integer levels of the layout, shape (ny, nx).
         layout_pitch_um: pitch of the layout in µm.
         scan_pitch_um: pitch (y, x) of the scan in µm. It is needed if ``scan`` is an array.
-        model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or ``homography``,
-            each of which contains all kinds before it. With ``ladder``, every kind is fitted, and the result
-            is the simplest kind that predicts held-out blocks as well as every later kind. With ``affine``,
-            ``homography`` and ``ladder``, a bend or creep may be fitted in addition (see
+        model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or ``homography``.
+            Each of these kinds contains all kinds named before it. With ``ladder``, every kind is fitted, and
+            the result is the simplest kind that predicts held-out blocks as well as every more general kind.
+            With ``affine``, ``homography`` and ``ladder``, a bend or creep may be fitted in addition (see
             ``Registration.bend_um``).
         fast_axis: the axis along which the tip moved fast. It is used only if the scan does not state it.
             None counts as ``x``.

@@ -1,5 +1,5 @@
-"""Estimate the quadratic surface that the heights of a registered scan contain in addition to the print, and
-the error of the registration's warp.
+"""For a registered scan, estimate two things: the quadratic surface that the heights contain in addition to
+the print, and the error of the warp.
 
 Gain, quadratic surface and warp are fitted many times. Each time, another block of the field is left out
 (jackknife). Some structure in the heights does not follow from the layout and causes errors of the fits. If
@@ -34,8 +34,8 @@ _MAGNIFICATION = 3
 
 @dataclass(frozen=True)
 class WarpError:
-    """The error of the warp between a scan and its layout. Also the quadratic surface that the heights
-    contain in addition to the print, with its error.
+    """The error of the warp between a scan and its layout, and the quadratic surface that the heights contain
+    in addition to the print. The error of this surface is included.
 
     Attributes:
         covariance: covariance matrix, of shape (k, k), of the coefficients of the warp's generators (see
@@ -90,8 +90,8 @@ class WarpError:
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
-    """Estimate the quadratic surface that registered heights contain in addition to the print, and the error
-    of the registration's warp.
+    """For registered heights, estimate two things: the quadratic surface that they contain in addition to the
+    print, and the error of the registration's warp.
 
     Args:
         height: registered heights, shape (ny, nx), NaN where not valid.
