@@ -149,7 +149,7 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
 
 
 def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return a table that states how well each scan of the dataset was registered, with one row per scan. A
+    """Return a table with one row per scan of the dataset, which states how well the scan was registered. A
     value that could not be computed is NaN.
     """
     import pandas as pd

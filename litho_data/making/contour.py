@@ -156,8 +156,10 @@ def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
     not marked as a defect.
 
     Args:
-        covered: measured share of each pixel that film covers, shape (ny, nx), NaN where not measured.
-        layout_share: the share that film should cover according to the layout, shape (ny, nx).
+        covered: measured share of each pixel's area that is covered by film, shape (ny, nx), NaN where not
+            measured.
+        layout_share: share of each pixel's area that should be covered by film according to the layout, shape
+            (ny, nx).
         depth_px: distance in pixels. Deviations closer than this to an edge of the layout may belong to the
             print and are not marked. The marked defects are widened by the same distance.
     """

@@ -52,9 +52,9 @@ def height_sigma(
         z_uncertainty: relative uncertainty of the z scale; 0 if the z scale was not calibrated.
 
     Returns:
-        Two items: the uncertainty in µm as float32 on the layout's grid, NaN where not valid; and its root
-        mean squares over the scan, in nm, in a mapping. The key ``sigma_<part>_nm`` stands for one part, and
-        the key ``sigma_nm`` for the total uncertainty.
+        Two items. The first is the uncertainty in µm as float32 on the layout's grid, NaN where not valid.
+        The second is a mapping with its root mean squares over the scan, in nm. The key ``sigma_<part>_nm``
+        stands for one part, and the key ``sigma_nm`` for the total uncertainty.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape

@@ -178,7 +178,7 @@ class FieldJob:
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
 
     def _level(self, chain: Chain) -> None:
-        """Run the operations that follow the reading of heights. They level the scan. Unless it is a
+        """Run the operations that follow the reading of heights. They level the scan. If the scan is not a
         reference scan, they also register and resample it, and compute the uncertainty of its heights.
         """
         of_dataset = self.field.use == "dataset"
@@ -264,7 +264,8 @@ def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
     use the layout, because no layout can be located in a reference scan.
 
     In scans of a flat surface, polynomial steps of the same degrees replace the layout-aware steps. In scans
-    of steps and gratings, nothing replaces them, because polynomials would remove part of the structure.
+    of calibration steps and gratings, nothing replaces the layout-aware steps, because polynomials would
+    remove part of the structure.
     """
     kept = []
     for step in steps:

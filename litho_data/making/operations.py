@@ -145,8 +145,8 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     """Compute the height map of the film on the layout's grid, and its uncertainty.
 
-    The height of a pixel is the thickness of the film times the share of the pixel that the film covers.
-    Pixels with dirt or pits are invalid.
+    The height of a pixel is the thickness of the film times the share of the pixel's area that is covered by
+    film. Pixels with dirt or pits are invalid.
     """
     from litho_data.making.contour import coverage, edge_shift_px, foreign, with_moved_edges
     from litho_data.register.refine import interior_of

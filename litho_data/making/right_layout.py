@@ -217,10 +217,11 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
     relative growth of this slope with the dose, d ln slope / d ln dose.
 
-    The exposure is the level times the dose. Let g(T) be the heights as a function of the blurred levels T. A
-    larger dose stretches this curve, so the growth is cov(T, T g') / cov(T, g). Here, g is a fitted parabola,
-    and the growth is one plus the share of the slope that comes from the quadratic term. This share is
-    negative if the print saturates, and the growth may then be negative too.
+    The exposure is the level times the dose. Let g(T) be the heights as a function of the blurred levels T.
+    If the dose becomes larger by a factor c, the heights become g(c T), so the growth is cov(T, T g') /
+    cov(T, g). Here, g is a fitted parabola, and the growth is one plus the share of the slope that comes from
+    the quadratic term. This share is negative if the print saturates, and the growth may then be negative
+    too.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)

@@ -34,8 +34,8 @@ class Step:
 
     Each input is a mapping with the keys ``name`` and ``sha256``. The name of a file is its path below the
     data folder. Each output has the keys ``name``, ``sha256``, ``dtype``, ``shape``, ``unit`` and ``dims``.
-    ``code_sha256`` identifies the source code that ran. It is not part of the step's id, because some changes
-    of the code, such as moving a comment, do not change a result.
+    ``code_sha256`` identifies the source code that ran. This hash is not part of the step's id, because some
+    changes of the code, such as moving a comment, do not change a result.
     """
 
     op: str

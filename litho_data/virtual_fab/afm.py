@@ -141,8 +141,8 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Add scars along the fast axis and spikes of a single pixel to a copy of the heights, and return the
-    copy. Each scar and each spike has a random sign.
+    """Return a copy of the heights, to which scars along the fast axis and spikes of a single pixel have been
+    added. Each scar and each spike has a random sign.
     """
     scarred = height.copy()
     ny, nx = height.shape

@@ -66,8 +66,8 @@ class Job:
         return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Return the canvas of the field, which is the layout with its guard frame and its position in the
-        write field.
+        """Return the canvas of the field, i.e. the layout with its guard frame. The canvas also states where
+        the layout lies in the write field.
         """
         side_um = self.write_field_um or max(self.level.shape) * pitch_um
         return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)

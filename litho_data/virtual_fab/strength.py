@@ -1,5 +1,5 @@
-"""Measure how much a knob (an effect that the virtual fab adds) changes the scans, and find the strength of
-the knob that causes a given change.
+"""Measure how much a knob (an effect that the virtual fab adds) changes the scans, and find the strength at
+which the knob causes a given change.
 """
 
 from collections.abc import Callable, Sequence
