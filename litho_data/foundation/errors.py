@@ -15,9 +15,9 @@ class InputError(ValueError):
     """An error for bad input. Its one-line message says what is wrong, what was given and what is allowed,
     and may add a hint.
 
-    The command lines print the message without a traceback and exit with code 2; every other exception is a
-    defect of this project. If ``got`` is an exception, the message states the cause of this exception in
-    plain words.
+    All commands print the message without a traceback and exit with code 2. Every other exception is a defect
+    of this project. If ``got`` is an exception, the message states the cause of this exception in plain
+    words.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):

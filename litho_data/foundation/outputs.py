@@ -1,8 +1,8 @@
 """Rules for the option ``--out`` of every command: a command replaces only its own older result.
 
-A missing or empty folder is accepted. The folder of an earlier run is accepted if the command, the dataset,
-model or design, and the settings are the same. The run is then resumed or repeated. Anything else is refused,
-and nothing is changed.
+A missing or empty folder is accepted. The folder of an earlier run is accepted if that run had the same
+command, the same input (dataset, model or design) and the same settings. It is then resumed or repeated.
+Anything else is refused, and nothing is changed.
 """
 
 import json

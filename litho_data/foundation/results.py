@@ -34,8 +34,8 @@ class Record(BaseModel):
 
 
 class Result(Record):
-    """Base class of records that are written as result files. Subclasses set ``SCHEMA``, the name and version
-    of the file's schema, and ``FILE_NAME``.
+    """Base class of records that are written as result files. Subclasses set ``FILE_NAME`` and ``SCHEMA``.
+    ``SCHEMA`` contains the name and the version of the file's schema.
     """
 
     SCHEMA: ClassVar[str]

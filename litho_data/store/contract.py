@@ -64,8 +64,8 @@ def require_complete(path: Path) -> None:
 
 
 def missing_files(path: Path) -> Iterator[str]:
-    """Yield the names of missing metadata documents and chunks. A file is missing if it does not exist,
-    although the metadata of the store declare it.
+    """Yield the names of missing metadata documents and chunks. A file is missing if the metadata of the
+    store declare it but it does not exist.
     """
     names = file_names(path)
     with damaged(f"metadata of {path}"):
