@@ -17,8 +17,8 @@ designs = {
 
 # %% [markdown]
 # `without` was designed for a perfect printer. For `with`, a model trained on measured prints was used. A good
-# score from its own model proves nothing about a design. So another model, used for neither design, predicts
-# both prints, and their images are scored:
+# score proves nothing if it comes from the design's own model. So another model, used for neither design,
+# predicts both prints, and their images are scored:
 
 # %%
 judged = {
