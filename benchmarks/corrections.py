@@ -163,9 +163,9 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     median = np.median([over_idle(row) for row in rows])
     return (
         "Each corrected layout is compared with the better of two others, the layout of nominal heights and "
-        f"the best affine layout. In {len(worse)} of {len(rows)} cases, the error of the corrected print is "
-        f"more than 5 % larger{named}. The median ratio of the errors is {median:.2f}. For a blaze, the "
-        f"ratio to the error of the best affine layout is {np.median(blazes):.2f}. "
+        f"the affine layout chosen by the models. In {len(worse)} of {len(rows)} cases, the error of the "
+        f"corrected print is more than 5 % larger{named}. The median ratio of the errors is {median:.2f}. "
+        f"For blazes, the median ratio to the error of this affine layout is {np.median(blazes):.2f}. "
         f"The errors of {len(inside)} of {len(rows)} prints lie in the range that the correction stated."
     )
 

@@ -103,10 +103,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         ("model", "parameters", "offset fitted (k = 1)", "offset, gain, tilt and bow fitted (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds. Each scan is predicted by a model trained on other scans, plus the smooth background of "
-        "these scans. Then k terms are fitted to the scan, on pixels that are not scored. Brackets contain "
+        "folds. Each scan is predicted by a model and a smooth background, both fitted to other scans. "
+        "Then k terms are fitted to the scan, on pixels that are not scored. Brackets contain "
         "95 % intervals from resampling scans. For what the layout cannot explain, the 6 prints are "
-        "resampled; this value includes errors common to a place, field or print.",
+        "resampled; this value includes errors that depend on place, field or print.",
     )
 
 

@@ -37,7 +37,7 @@ def test_the_pages_say_where_the_locked_scans_take_part():
         assert locked & {part.split("/")[0] for part in parts}
     assert paper.split.lock_box_opened
     page = " ".join((FOLDER / "README.md").read_text("utf-8").split())
-    assert "These draws include the locked scans" in page
+    assert "The four draws include the locked scans" in page
     assert "4 locked scans belong to no fold and affect no number here" in texts(FOLDER)["benchmark"]
 
 

@@ -94,7 +94,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
         ratio = np.median(bias[:, 1] / bias[:, 0])
         figures.append(
             Figure(
-                "error of the base model's values: without findings, with findings; median ratio of the two",
+                "bias of the base model: without findings, with findings; median ratio of the two",
                 f"{100 * without:.1f} %, {100 * with_found:.1f} %; {ratio:.2f}",
                 "at most 1/3",
             )
@@ -132,7 +132,7 @@ def _of_singles(trials: Sequence[Trial]) -> list[Figure]:
         _causes("… noticed, with or without a name or law", counted(other), _SEEN, "all but one"),
         Figure("… trials with a false name", share(bool(one.false_names) for one in other), "at most 1"),
         Figure(
-            f"all other trials: error of at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
+            f"all but other form: error of at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
             share(map(reaches_floor, rest)),
             "at least 90 %",
         ),
