@@ -346,9 +346,9 @@ def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float)
 
 def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
     """Yield pairs of prints of shape (ny, nx), in µm, that registration and levelling cannot distinguish from
-    the measured print. In the two prints of a pair, one quantity differs by plus and minus its standard
-    deviation. This quantity is a term of the print's own tilt and bow, a factor common to all these terms, or
-    a parameter of the affine registration.
+    the measured print. The two prints of a pair differ from the measured print in one quantity: by plus its
+    standard deviation in the first, and by minus it in the second. This quantity is a term of the print's own
+    tilt and bow, a factor common to all these terms, or a parameter of the affine registration.
     """
     measured = height_um.double().cpu().numpy()
     removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])

@@ -198,5 +198,5 @@ def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Se
             "judges",
             got=f"{both[0]!r} twice",
             wanted="judges with names that no arm has",
-            hint="the models of the arms judge in any case",
+            hint="the model of every arm is a judge already",
         )

@@ -112,9 +112,9 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the wrong findings. Only findings that name a cause are considered. Such a finding is wrong if
-    it is the right answer for none of the planted causes. The form that changes the printer (``base`` of the
-    draw) counts as one of the planted causes.
+    """Return the wrong findings. Only findings that name a cause are considered. Such a finding is wrong
+    unless it is the right answer for one of the planted causes. The form that changes the printer
+    (``base`` of the draw) counts as one of the planted causes.
     """
     return [
         " | ".join(named.names)

@@ -223,7 +223,7 @@ def of_others(
 
     Args:
         question: the question.
-        open_: the open questions, which contain the noise.
+        open_: the open questions, together with the noise of the scans.
         prints: number of prints in the plan.
         scans: number of scans of each print.
         size_px: side length of a print in pixels.
