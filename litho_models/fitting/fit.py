@@ -133,7 +133,8 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
     """Fit ``FIRST_MODEL`` to the scans, and return the heights, µm, that it predicts for them. The training
     of a network estimates its first per-scan terms from these heights.
     """
-    small = build_model(FIRST_MODEL, **common_geometry(scans))
+    geometry = common_geometry(scans)
+    small = build_model(FIRST_MODEL, **geometry)
     if config.nuisance != "none":
         fit_small_model(small, scans, config.nuisance)
     return [predict_scan(small, scan) for scan in scans]
