@@ -17,7 +17,8 @@ def test_the_page_quotes_the_committed_measurement():
 def test_times_on_a_gpu_are_wall_clock_times():
     record = json.loads(speed.OUT.read_text(encoding="utf-8"))
     for device, clock in (("CPU", "processor"), ("NVIDIA H200", "wall-clock")):
-        assert f"The times of prediction and design are {clock} times" in speed.as_markdown(record | {"device": device})
+        page = speed.as_markdown(record | {"device": device})
+        assert f"The times of prediction and design are {clock} times" in page
 
 
 def test_a_model_is_measured_in_a_process_of_its_own(tmp_path, monkeypatch):
