@@ -102,7 +102,7 @@ def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
     """Train one model for each fold on the scans outside this fold, and one model on all scans. Before the
-    training, each layout is multiplied by the dose of its scan, as everywhere in the loop.
+    training, each layout is multiplied by the dose of its scan, as for all predictions of the loop.
 
     Args:
         scans: the scans.

@@ -39,7 +39,7 @@ class Check:
         state: the model, with all its effects.
         others: the causes and laws in the model; each of them is compared with the cause that is checked.
         laws, tables: all laws and tables that could replace a cause.
-        left_nm2: mean square of the part of the model's residual that features of layout and position can
+        left_nm2: the part of the model's mean squared residual that features of layout and position can
             still explain, nm².
         secants: the changes that the laws and tables would make to the predictions.
     """
@@ -123,8 +123,9 @@ class Check:
         """Test whether a table could replace a cause that has passed the checks of ``of``. If it could,
         reject the cause.
 
-        The cause is rejected if two conditions hold: the gain of the table is more than twice the gain of the
-        cause, and held-out scans do not confirm the cause when it is added to the model with this table.
+        The cause is rejected if two conditions hold: in the model without the cause, the gain of the table is
+        more than twice the gain of the cause, and held-out scans do not confirm the cause when it is added to
+        the model with this table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -139,8 +140,8 @@ class Check:
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
         """Return the law with the largest predicted gain among the laws with at most ``numbers`` parameters.
-        Return None if no predicted gain exceeds the fraction ``WORTH_FITTING`` of the gain of the cause that
-        is checked.
+        Return None if no predicted gain exceeds ``WORTH_FITTING`` times the gain that the model with the
+        cause still has over ``state``.
         """
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)

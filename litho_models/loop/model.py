@@ -206,8 +206,8 @@ class Twin:
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
         """Replace the strengths that the given scans do not determine, and return the new twin. The strengths
         of the groups to which these scans belong are kept. The strengths of all other groups are replaced by
-        the means of the kept strengths. If no strength is kept, each strength is set to its null value, at
-        which the effect does nothing.
+        the means of the kept strengths. If no strength of an effect is kept, its strengths are set to their
+        null values, at which the effect does nothing.
         """
         effects = {}
         for name, one in self.effects.items():

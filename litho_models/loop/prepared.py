@@ -205,7 +205,7 @@ def sample_border_px(size: int) -> int:
     """Return the width, in pixels, of the border that fits leave out of a scan. The prediction at these
     pixels depends on surroundings outside the layout. ``size`` is the length of the shorter axis of the scan.
 
-    Only fits leave out the border. Errors are scored on all pixels, as in the benchmark
+    The errors in ``ErrorRow`` are nevertheless scored on all pixels, as in the benchmark
     (``NuisanceProtocol.border_px``).
     """
     return min(8, size // 8)

@@ -273,7 +273,7 @@ class CloseLoop(Result):
         gain_nm: decrease of the headline error (see ``ErrorRow.is_headline``) from the base model to the
             corrected model. ``over_scans`` and ``over_prints`` contain the confidence intervals of this
             decrease.
-        decisions: answers to the open questions of this loop, decided with the prints of further stores.
+        decisions: decisions on the open questions of this loop, based on the prints of further stores.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
