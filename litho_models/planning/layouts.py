@@ -81,8 +81,8 @@ class Limits:
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
         """Derive the limits from earlier prints. Very rare levels at both ends are excluded: the levels below
         the lowest allowed level together cover less than a thousandth of the area of these prints, and so do
-        the levels above the highest allowed level. The highest spatial frequency is that of the finest
-        structures in these prints.
+        the levels above the highest allowed level. The highest spatial frequency is
+        ``open_.cutoff_per_um``.
 
         Raises:
             InputError: every earlier layout has only one level, or nearly the whole area of these layouts has
@@ -340,7 +340,8 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return how well a layout matches shifted copies of itself, as the registration would measure it.
+    """Return the self-similarity of a layout: how well it matches shifted copies of itself, as the
+    registration would measure it.
 
     If the value is 1, the layout matches a shifted copy of itself perfectly, and registration cannot
     determine the shift.

@@ -129,9 +129,9 @@ class _Asking:
 
     def of_suspects(self) -> Question | None:
         """Return the question of which unconfirmed effect, if any, explains the residual. An effect is
-        unconfirmed if it is significant in screening and held-out scans did not confirm it. Return None if no
-        effect is unconfirmed. Also return None if only one effect is unconfirmed and the catalogue states
-        whether the printer or the microscope causes it.
+        unconfirmed if it is significant in screening, but held-out scans did not confirm it or a later check
+        rejected it. Return None if no effect is unconfirmed. Also return None if only one effect is
+        unconfirmed and the catalogue states whether the printer or the microscope causes it.
         """
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2

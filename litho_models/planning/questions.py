@@ -111,8 +111,8 @@ class Rival(Record):
             the source.
         effects: parameter values of all effects in the model, keyed by the name of the effect.
         vector: the p fitted parameters. The parameters of the base come first.
-        information: normal matrix of the fit, µm², of shape (p, p). The fit uses only some of the pixels, so
-            the matrix is scaled to the number of all measured pixels.
+        information: normal matrix of the fit, µm², of shape (p, p). The fit uses only some pixels of each
+            scan's window, so the matrix is scaled to the number of all measured pixels of the windows.
         covariance: cluster-robust covariance of the parameters, of shape (p, p). The clusters are prints or
             scans.
     """
