@@ -67,10 +67,10 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
     """Choose at random the causes of each trial of a board. The trials are in random order, and each has its
     own printer parameters.
 
-    Knobs and forms are drawn at random without replacement. When all of them have been drawn, the drawing
-    starts again. On the board ``singles``, a trial with a knob is of kind ``alias`` if the base model can
-    imitate the effect of the knob or the per-scan terms can absorb it, and otherwise of kind ``in-form``. The
-    sizes of the causes are drawn log-uniformly.
+    Knobs and forms are in separate lists, from which they are drawn at random without replacement. When all
+    of a list have been drawn, the list starts again. On the board ``singles``, a trial with a knob is of kind
+    ``alias`` if the base model can imitate the effect of the knob or the per-scan terms can absorb it, and
+    otherwise of kind ``in-form``. The sizes of the causes are drawn log-uniformly.
 
     Raises:
         InputError: the seed is negative.

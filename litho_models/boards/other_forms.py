@@ -208,7 +208,7 @@ def _alternate_slices(rng: Rng) -> Law:
 
 @_form("focus-step", "dose", "µm", 2.0)
 def _focus_step(rng: Rng) -> Law:
-    """Blur (standard deviation) added to the spot in all prints after a random print near the middle of the
+    """Blur (standard deviation) added to the spot in prints after a random point near the middle of the
     printing order.
     """
     first = rng.uniform(-0.25, 0.25)
@@ -268,7 +268,7 @@ def _fringes(rng: Rng) -> Law:
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: Rng) -> Law:
-    """Amplification of detail finer than 0.6–1.2 µm, so that edges overshoot."""
+    """Relative increase of detail finer than 0.6–1.2 µm, so that edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
         surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
