@@ -46,7 +46,8 @@ def analyse_noise(
         seed: seed of the random choice of pixels.
 
     Raises:
-        InputError: the store or the residuals cannot be read, or the residuals belong to another dataset.
+        InputError: the store or the residuals cannot be read or do not belong together, ``model`` is given
+            without a benchmark, or there are residuals of fewer than three scans.
     """
     if model is not None and residuals is None:
         raise InputError(

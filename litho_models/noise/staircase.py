@@ -77,8 +77,8 @@ def step_print(
         scan_id: name of the scan in the result.
         height_um: measured height, µm, with shape (ny, nx); NaN where it was not measured.
         pitch_um: pixel pitch along y and x, µm.
-        level_height_um: nominal height of a step, µm. An edge is found only if the heights on its two sides
-            differ by at least about half this step.
+        level_height_um: nominal height of a step, µm. An edge between narrow treads is found only if their
+            heights differ by at least about half this step.
 
     Raises:
         InputError: no step was found.
