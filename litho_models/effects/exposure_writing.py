@@ -203,8 +203,8 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     separating="rescan at 25 nm per pixel",
 )
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add ripples along the slow axis y, which come from the hatching of pitch p: H + 1[M > 0] (a cos 2π f y
-    + b sin 2π f y).
+    """Add ripples that come from the hatching of pitch p: H + 1[M > 0] (a cos 2π f y + b sin 2π f y), where y
+    is the position along the slow axis.
 
     The frequency f is the alias frequency |1/p - 1/dx|, where dx is the pixel size. The ripples have a fixed
     phase in the write field, so they are the same in every print.

@@ -132,8 +132,8 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """Dilate rows by a parabola. The surface is approximated by linear pieces that are half a pixel long.
     ``height`` and the result have shape (..., nx).
 
-    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If the piece does
-    not extend to this distance, the tip touches the piece at its nearer end.
+    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point does
+    not lie on the piece, the tip touches the piece at the end that is nearer to this point.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)
