@@ -13,7 +13,7 @@ _CHANCE = 0.05
 
 def benchmark_verdict(result: Benchmark) -> str:
     """Return sentences that state which model predicts best, how much worse the second-best model is, whether
-    chance explains this difference, and how large the noise floor is.
+    chance may explain this difference, and how large the noise floor is.
 
     If the scans come from several prints, the test of the difference treats prints instead of scans as
     independent.
