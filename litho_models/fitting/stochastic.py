@@ -218,8 +218,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
     """Return the number of pixels by which tiles may extend beyond a scan in training. As in prediction, this
-    number is at least the overlap of the tiles. If a scan is smaller than a tile, the number is larger, so
-    that the extended scan contains a whole tile.
+    number is at least the overlap of the tiles. It is larger if the extended scan would otherwise be smaller
+    than a tile.
     """
     if model.tile is None or config.crops != "random":
         return 0
