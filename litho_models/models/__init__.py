@@ -65,9 +65,9 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
 
 
 def registered_sources(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """If a model uses code outside this package, return hashes of this code. It is the code of the model's
-    class, if the class was registered, and of those registered parts that ``settings`` names. Otherwise, the
-    returned dict is empty.
+    """Return hashes of the registered class and the registered parts on which a model depends: its class, if
+    it was registered, and those registered parts that ``settings`` names. If there are none, the returned
+    dict is empty.
     """
     modular = issubclass(model_class(name), Printer)
     named = settings["parts"] if modular else [settings.get("illumination")]

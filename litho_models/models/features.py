@@ -237,8 +237,8 @@ class RandomFeatures(Features):
     features (the first list that ``features`` returns), standardised. V and c are random and are not fitted.
 
     The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). Each
-    random feature depends on ``inputs`` simple features, whereas each product in ``Features`` depends on only
-    two. The weights are still found in closed form.
+    random feature depends on ``inputs`` simple features, whereas each product in ``Features`` depends on at
+    most two. The weights are still found in closed form.
     """
 
     name = "random-features"

@@ -161,7 +161,7 @@ class Pbl(Simulator):
     the layout within some micrometres of a pixel influences its height. This influence is the same along x
     and y. ``scan_axis`` describes how the height along x influences the measured height. This second
     influence may come from the microscope. ``scan_axis`` takes part in the fit, so that the other networks do
-    not learn the influence of the microscope. ``printer()`` returns the model without ``scan_axis``.
+    not learn this influence. ``printer()`` returns the model without ``scan_axis``.
     """
 
     name = "pbl"
