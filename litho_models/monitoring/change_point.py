@@ -4,7 +4,7 @@ false alarms.
 The test makes one comparison for each new print. The comparison for a print assumes that the mean changes in
 a step at this print and stays changed until the last print. A t test with a pooled spread compares the values
 before the step, including all reference prints, with the values after the step. Although the mean and the
-spread must be estimated from the prints, Student's t distribution is exact for any number of reference
+spread must be estimated from the prints, Student's t distribution holds for any number of reference
 prints. The method is the likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu
 and Kang 2003, J. Quality Technology 35, 355). The given rate of false alarms is divided among the comparisons
 (Bonferroni). All comparisons together therefore do not exceed this rate, even if they are correlated. A step

@@ -154,8 +154,9 @@ class CheckedModel(Record):
 class Alarm(Record):
     """A step in the mean of a monitored quantity. ``since`` is the name of the first print after the step.
 
-    ``step`` is the relative difference between the mean of the prints from ``since`` on and the mean of the
-    earlier prints. The confidence interval of ``step`` does not account for the choice of ``since``.
+    ``step`` is the mean of the prints from ``since`` on, minus the mean of the earlier prints, relative to
+    the mean of the earlier prints. The confidence interval of ``step`` does not account for the choice of
+    ``since``.
     """
 
     since: str
