@@ -53,7 +53,7 @@ def shrunk_line_offsets(
     v). The estimate is their best linear unbiased prediction (BLUP).
 
     Each line is divided into blocks. The noise variance of a line mean is estimated from the scatter of the
-    block means within the lines. This estimate holds even if the noise is correlated along the line. The
+    block means within the lines. This estimate allows for correlation of the noise along the line. The
     estimate of v is the variance of the line means minus this noise variance. If all lines have the same
     number of blocks, this moment estimate equals the restricted maximum likelihood estimate (REML). The
     offset of a line without used pixels is 0.
