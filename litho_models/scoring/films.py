@@ -66,9 +66,9 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """Find the connected parts of two masks. Parts of fewer than four pixels are ignored. For each part of
-    one mask, count the parts of the other mask that it overlaps. Return the counts for the parts of the first
-    mask, and the counts for the parts of the second mask.
+    """Find the connected parts of two masks. For each part of one mask with at least four pixels, count the
+    parts of this size in the other mask that it overlaps. If it overlaps only smaller parts, the count is 1.
+    Return the counts for the parts of the first mask, and the counts for the parts of the second mask.
     """
     from scipy.ndimage import label
 
@@ -81,8 +81,7 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
         [np.bincount(own[kept], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
         for kept in (slice(None), real)
     )
-    # If a part overlaps only parts that are smaller than the size limit, its count is 1. It then has a
-    # partner, but does not merge several parts.
+    # With the count 1, a part that overlaps only smaller parts has a partner, but merges nothing.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

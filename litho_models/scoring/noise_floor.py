@@ -42,7 +42,7 @@ class PolicyFloor(Record):
 
 class NoiseFloor(Record):
     """The noise floor: the error that noise alone causes, nm. ``kind`` says how the floor was estimated, and
-    ``source`` names the data.
+    ``source`` says from what or, if the floor is unknown, why.
 
     ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error for the
     policy ``offset``, i.e. after an offset is fitted to each scan. ``by_policy`` contains the floors for each

@@ -23,11 +23,12 @@ class ScanFigures(Record):
     are removed.
 
     ``gain`` is the slope of the measured height as a function of the predicted height. ``gain_error`` is the
-    standard error of the gain (see ``print_gain``). ``error_nm`` is the mean absolute error for the policy
-    ``full``, i.e. after 7 terms including the gain are fitted to the scan. The terms are not fitted to the
-    pixels on which the error is scored. ``order`` is the position of the scan in printing order.
-    ``relief_nm`` and ``steepness`` are the standard deviation and the rms slope of the predicted height,
-    which characterise the layout. ``held_out`` is True if the model was not trained on the scan.
+    standard error of the gain (see ``print_gain``), or None if there is only one block. ``error_nm`` is the
+    mean absolute error for the policy ``full``, i.e. after 7 terms including the gain are fitted to the scan.
+    The terms are not fitted to the pixels on which the error is scored. ``order`` is the position of the scan
+    in printing order. ``relief_nm`` and ``steepness`` are the standard deviation and the rms slope of the
+    predicted height, which characterise the layout. ``held_out`` is True if the model was not trained on the
+    scan.
     """
 
     scan: str

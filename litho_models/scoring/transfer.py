@@ -16,8 +16,8 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class LevelError(Record):
-    """The mean (``bias_nm``) and the standard deviation (``sd_nm``) of the error at all pixels of one layout
-    level. ``scans`` is the number of scans in which the level occurs.
+    """The mean (``bias_nm``) and the standard deviation (``sd_nm``) of the error at the scored pixels of one
+    layout level. ``scans`` is the number of scans in which the level occurs.
     """
 
     level: int
@@ -103,8 +103,8 @@ def _band_powers(error: Array, prediction: Array, usable: Array, pitch_um: float
 
     ``error`` is measured minus predicted height, and 0 at pixels that are not usable. Unusable pixels
     therefore lower the power of the error in their line. To lower the power of the prediction and the number
-    of terms in the same way, both are multiplied by the usable share of the line, weighted with the window.
-    Unusable pixels then do not bias the results.
+    of terms in the same way, both are multiplied by the usable share of the line, weighted with the squared
+    window. Unusable pixels then do not bias the results.
     """
     window = np.hanning(error.shape[1])
     share = usable @ window**2 / np.sum(window**2)
