@@ -87,8 +87,8 @@ def plan_folds(
     open_lock_box: bool = False,
 ) -> list[Fold]:
     """Return the folds of a split. In the split ``paper``, training and held-out sets contain quadrants of
-    the same scans, and no scans are locked. All other splits leave out the locked scans unless
-    ``open_lock_box`` is set, in which case an additional fold holds them out.
+    the same scans, and locked scans are used like all others. All other splits leave out the locked scans
+    unless ``open_lock_box`` is set, in which case an additional fold holds them out.
 
     Raises:
         InputError: there are too few scans, there are no locked scans although ``open_lock_box`` is set, or
