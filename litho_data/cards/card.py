@@ -185,7 +185,7 @@ class Process(Record):
     the tip, and the name of a file with a levelling recipe.
 
     Without ``level``, a plane is subtracted from each scan, unless the card says that the scans are levelled.
-    The plane is fitted together with the layout, so that no part of the print is removed. ``tip`` is the
+    The plane is fitted together with the layout, so that the slope of the print is kept. ``tip`` is the
     radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
     """
 
