@@ -13,8 +13,8 @@ _NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
 
 
 def is_plain_name(name: object) -> bool:
-    """Return whether a name is plain. A plain name is a valid file name on every system. No program can
-    mistake it for a path, a hidden file or a command-line option.
+    """Return whether a name is plain. A plain name is a valid file name on every system. It is not a
+    path, a hidden file or a command-line option.
     """
     return (
         isinstance(name, str)

@@ -25,8 +25,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
             a result may contain. If a path names a subfolder, this subfolder may contain anything.
 
     Raises:
-        InputError: the path is the current folder or a file, or the folder contains a file that does not
-            belong to an older result. The message names what was found.
+        InputError: the path is the current folder or a file, or the folder contains a file or a subfolder
+            that does not belong to an older result. The message names what was found.
     """
     folder = Path(path)
     if folder.exists() and folder.samefile(Path.cwd()):
