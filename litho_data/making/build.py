@@ -62,15 +62,16 @@ def build_dataset(
         workers: number of local processes.
         dask: address of a Dask scheduler, which is used in place of local processes. The store is the same
             either way.
-        strict: if true, a store is built only if every id has a scan and a layout that can be used.
+        strict: if true, nothing is built if any id has to be left out, i.e. if its scan or its layout is
+            missing or cannot be used.
         seed: seed of the robust estimator in the registration.
         tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans. It replaces the
             value in the card. Pixels that the tip possibly did not touch become invalid.
 
     Raises:
         InputError: the card is bad, no scan is usable, ``tip`` is not a radius or ``blind``, or ``out``
-            contains something other than a store. With ``strict``, the error is also raised if any id lacks a
-            usable scan or a usable layout.
+            contains something other than a store. With ``strict``, the error is also raised if any id has to
+            be left out.
     """
     listing = list_fields(card_path, data_dir)
     if tip is not None:

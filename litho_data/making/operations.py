@@ -58,7 +58,7 @@ def load_recipe(path: Path | None) -> dict[str, Any]:
     """Read a levelling recipe from a file, and return it in canonical form.
 
     Without a file, return a recipe that subtracts a plane. The plane is fitted together with the layout, so
-    that no part of the print is removed.
+    that the slope of the print is kept.
     """
     from litho_data.level import Recipe
 

@@ -18,8 +18,8 @@ ALL = "all scans"
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 # Limits of the scale factor from a scan to its layout. If the factors differ from 1 by more than the first
 # value, but from each other by less than the second value, the pitch in the card is probably wrong. If the
-# factor of a single scan differs from those of the other scans by more than the third value, the size of this
-# scan is probably wrong.
+# factor of a single scan differs from the median over the scans by more than the third value, the size of
+# this scan is probably wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
 # Largest accepted value of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints
