@@ -1,8 +1,8 @@
 """Run parsers of other projects in a child process, within limits of computing time and memory.
 
 A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. When a
-process first needs such a parser, it starts a child process, and then uses this child for all files. It
-starts another child only after a parser has exceeded a limit or crashed.
+process first needs such a parser, it starts a child process, and then runs all such parsers in this child.
+It starts another child only after a parser has exceeded a limit or crashed.
 """
 
 import atexit

@@ -43,7 +43,7 @@ def read_layout(
     Raises:
         InputError: the file does not exist, is damaged, has a format that is not supported, or is not grey;
             its values are not levels or multiples of the grey step; ``average_px`` is given but the image has
-            more than two grey values; or the sidecar belongs to another file.
+            more than two grey values or is smaller than a square; or the sidecar belongs to another file.
     """
     file = require_file(path)
     if says := export_of(file):

@@ -220,8 +220,8 @@ def _settle_unit(
 
 
 def _to_um(values: Array, factor: float) -> Array:
-    """Convert the values to µm by multiplying them by the factor. If the factor is below one, the values are
-    divided by its inverse, so that 100 nm become exactly 0.1 µm.
+    """Convert the values to µm by multiplying them by the factor. If the factor is 1/n with an integer n, the
+    values are divided by n instead, so that 100 nm become exactly 0.1 µm.
     """
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor

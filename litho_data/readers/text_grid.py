@@ -1,5 +1,5 @@
-"""Find the coordinates in a table of numbers. The coordinates are either the first row and column of a
-matrix, or two columns with the x and y of points that fill a grid.
+"""Find the coordinates in a table of numbers. The coordinates are the first row, the first column or both
+of a matrix, or two columns with the x and y of points that fill a grid.
 """
 
 import re

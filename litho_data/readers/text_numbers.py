@@ -73,8 +73,9 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
     commas, and the text must not contain decimal points.
 
     Raises:
-        InputError: numbers seem to contain thousands separators, as in ``1,234.5;2,345.6``, or commas seem to
-            be both decimal commas and separators.
+        InputError: commas stand beside another separator but are not decimal commas, as in
+            ``1,234.5;2,345.6``; numbers seem to contain thousands separators; or commas seem to be both
+            decimal commas and separators.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
     for mark in "\t;,":  # remove a separator that stands at the end, or at the start, of every row
