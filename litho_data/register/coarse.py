@@ -93,9 +93,10 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
     """Return the orientations and polarities in which to look for keypoints.
 
-    If the correlation clearly determines the orientation, only this orientation is returned. Otherwise, one
-    orientation is returned for each of the four combinations of mirroring and polarity. One is enough,
-    because ORB keypoints match in any rotation.
+    If the correlation clearly determines the orientation, or if the upright hypothesis was preferred to one
+    with a higher correlation, only ``best`` is returned. Otherwise, one orientation is returned for each of
+    the four combinations of mirroring and polarity. One is enough, because ORB keypoints match in any
+    rotation.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
