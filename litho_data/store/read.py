@@ -71,7 +71,7 @@ def open_store(path: str | Path) -> Store:
 
 
 class Store:
-    """A dataset of printed scans. It keeps no arrays in memory, and reads an array when it is needed."""
+    """A dataset of printed scans. The arrays of a scan are read when they are needed, and are not kept."""
 
     def __init__(self, root: zarr.Group, path: Path):
         self.path = path
