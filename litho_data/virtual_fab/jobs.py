@@ -128,7 +128,7 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     """Make the jobs that print and scan the layouts of a dataset card.
 
     The columns ``turned_deg``, ``direction``, ``tip`` and ``pixel_size`` of the card's table may state how
-    each scan is made. If the table has these columns, rows with the same print and the same layout are scans
+    each scan is made. Rows with a value in any of these columns, the same print and the same layout are scans
     of one printed field.
 
     Args:

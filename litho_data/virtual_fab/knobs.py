@@ -28,8 +28,9 @@ class Knob:
         name: name of the knob on the command line and in the truth file.
         effect: name of the effect in the catalogue of effects, or `off-catalogue` if it is not listed there.
         stage: the stage of printing or scanning at which the effect acts.
-        role: what causes the effect, such as the process or the measurement. ``nuisance`` marks an effect
-            that no process model can predict. ``undetermined`` marks an effect whose cause is not known.
+        role: what causes the effect: the process or the measurement. ``nuisance`` marks an effect that no
+            process model can predict. ``undetermined`` means that the cause is either the process or the
+            measurement, but not known which.
         unit: unit of the strength.
         limit: largest strength that is accepted.
         meaning: text that says what the strength means, and which properties are drawn at random.

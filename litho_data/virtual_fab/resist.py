@@ -91,8 +91,8 @@ def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, 
 
 
 def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Return the heights after development. The knobs state how strongly capillary forces and the developer
-    change narrow features and steep flanks.
+    """Return the heights after capillary forces and the developer have changed narrow features and steep
+    flanks. The knobs state how strong these effects are.
     """
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:
