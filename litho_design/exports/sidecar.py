@@ -1,5 +1,5 @@
-"""The sidecar of an exported file. It contains heights, sizes and hashes, which the file itself cannot
-contain.
+"""The sidecar of an exported file. It contains the heights, sizes and hashes that the file itself
+cannot contain.
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ class MeasuredSource:
     ``size_um`` (the side of a square map, or the lengths along y and x).
 
     Some elements, such as a lens cap or a blaze, look the same at several positions or in several
-    orientations, so their scans cannot be registered. Align such a scan with the element and set ``aligned``.
+    orientations, so the registration of their scans may fail. Align such a scan with the element and set
+    ``aligned``.
     """
 
     path: Path = setting(..., "AFM height map of the printed part", option="--scan")

@@ -66,8 +66,8 @@ def estimated(
     Errors that remain in a measurement bias its scores. The same kinds of errors are therefore added once
     more. This changes a score, on average, by the same bias, which is then subtracted (bias correction by
     bootstrap, Efron and Tibshirani 1993, chapter 10). Other errors are hidden by a fit, such as levelling:
-    the fit makes the print look more like the expected print than it is. The mean change of a score over the
-    variants in ``hidden`` is therefore added.
+    the fit makes the print look more like the expected print than it is. For each pair in ``hidden``, the
+    mean change of a score is therefore added.
 
     The variants come in pairs. The two variants of a pair contain the same error with opposite signs. In
     ``left`` and ``hidden``, each pair changes one independent parameter by its standard deviation. If the

@@ -542,7 +542,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         at[columns] += found.x * unit[columns]
         return at, found
 
-    # The fit starts with blurred images. With the fine structure of the images, it could end in a false
+    # The fit starts with more strongly blurred images. With their fine structure, it could end in a false
     # optimum next to the right one.
     for more in (4 * blur_px, 0.0):
         images = smooth, fixed

@@ -111,9 +111,8 @@ def stroke_width_px(pixels: np.ndarray) -> float:
     """
     import cv2
 
-    # Strokes whose width is an even number of pixels have no pixel on their centre line, so the target is
-    # enlarged to twice its size. Then the distance from the centre line to the nearest dark pixel equals the
-    # width of the original stroke.
+    # The target is enlarged to twice its size. Then the distance from the middle pixels of a stroke to the
+    # nearest dark pixel equals the width of the original stroke, whether this width is even or odd.
     bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
     distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
     middle = (distance > 0) & (distance >= cv2.dilate(distance, np.ones((3, 3))))

@@ -28,7 +28,7 @@ _COLUMNS = 256
 
 class BandedPropagator:
     """A propagator between equal grids for a field whose rows are divided among several processes. It gives
-    the same result as the propagator from ``make_propagator``.
+    the same result as the propagator from ``make_propagator``, up to rounding.
 
     The field and the result contain only the rows of this process, as complex64 of shape (rows, size). The
     kernel is even along both axes, so only half of each column of its Fourier transform is stored.

@@ -25,11 +25,11 @@ class ASMPropagator(KernelPropagator):
 
     The transfer function is H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). For evanescent waves the root is
     imaginary, so these waves decay. Because H is sampled, the propagated field is periodic. The period is
-    long enough that the steepest rays do not wrap around, but it never exceeds 4096 pixels. Frequencies whose
-    rays would still wrap around are removed (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662).
-    A longer period slows down the construction of the propagator but not the propagation, because the kernel
-    is stored only at the separations that occur between the two grids. If the distance is negative, waves are
-    propagated backwards and evanescent waves are dropped.
+    extended until the steepest rays do not wrap around, but beyond 4096 pixels only as far as the grids need.
+    Frequencies whose rays would still wrap around are removed (after Matsushima and Shimobaba 2009,
+    doi:10.1364/OE.17.019662). A longer period slows down the construction of the propagator but not the
+    propagation, because the kernel is stored only at the separations that occur between the two grids. If the
+    distance is negative, waves are propagated backwards and evanescent waves are dropped.
 
     Pixels larger than half a wavelength represent rays only up to a certain angle, and for these rays the
     result is exact. Smaller pixels also represent rays close to grazing. Of the wave behind a rough element,
@@ -98,8 +98,7 @@ def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wave
     """Return the transfer function of free space, complex128 of shape (y, x). It is 0 at frequencies whose
     rays would wrap around.
     """
-    # Most frequencies occur with both signs. Only the phase of the shift between the grids depends on the
-    # sign.
+    # Most frequencies occur with both signs, and ``wave`` does not depend on the sign.
     (fy, row), (fx, column) = (torch.unique(axis.frequency.abs(), return_inverse=True) for axis in (y, x))
     squared = wavelength_um**-2 - fy[:, None] ** 2 - fx[None, :] ** 2
     wave = torch.exp(2j * math.pi * distance_um * torch.complex(squared, torch.zeros(()).double()).sqrt())

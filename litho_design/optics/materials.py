@@ -18,7 +18,7 @@ _SELLMEIER = {"ip-dip-2019": ((1.2899, 1.1283e-2), (6.0569e-2, 7.7762e-2), (1.18
 def refractive_index(resin: Resin | float, wavelength_um: float) -> float:
     """Return the refractive index of a resin. If ``resin`` is a number, this number is the index at all
     wavelengths. For the resin ``constant``, the index is 1 at all wavelengths. This value is arbitrary,
-    because only differences between wavelengths are used.
+    because ``Optics`` uses only differences between wavelengths.
     """
     if not isinstance(resin, str):
         return float(resin)

@@ -12,7 +12,7 @@ from litho_data.foundation.grid import PixelGrid
 
 # Sampling creates a copy of the spectrum around the frequency 1/pitch. The intensity of the evanescent wave
 # at this frequency must decay by the factor exp(-2 pi n), where n is the number below. For n = 2, this factor
-# is 4e-6.
+# is 3.5e-6.
 _DECAY_LENGTHS = 2.0
 
 

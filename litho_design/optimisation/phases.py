@@ -128,7 +128,8 @@ def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
     determines which cells have phases in this gap. Of 24 constants, the one with the largest amplitude at the
-    focus is used. This amplitude is the mean of exp(j (printed phase - phase of the lens)) over the cells.
+    focus is used. This amplitude is the modulus of the mean of exp(j (printed phase - phase of the lens))
+    over the cells.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):

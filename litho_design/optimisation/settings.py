@@ -92,8 +92,8 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """The penalty on the disagreement of several models.
 
-    A search minimises the largest loss that any model predicts, plus ``weight`` times the disagreement of the
-    models. The disagreement is given in waves.
+    A search minimises the combined loss of the models (by default the largest, see ``Task.over_models``),
+    plus ``weight`` times the disagreement of the models. The disagreement is given in waves.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})

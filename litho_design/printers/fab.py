@@ -1,7 +1,7 @@
 """The virtual fab (a simulated printer) as a judge of designs. It can print finished layouts, but it provides
 no gradients, so no layout can be designed with it. The fab shares no code with the models. It includes the
-hidden effects with which the training prints were simulated, so it prints a layout exactly as the simulated
-printer would.
+hidden effects with which the training prints of the models were simulated, so it prints a layout as the
+simulated printer would.
 """
 
 from __future__ import annotations

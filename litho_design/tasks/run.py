@@ -50,8 +50,8 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result; a printer is a virtual fab, which provides no
-            gradients and can only judge; or the weights of a model changed during the run.
+        InputError: ``out`` holds another design or result; a printer of the search is a virtual fab, which
+            provides no gradients and can only judge; or the weights of a model changed during the run.
     """
     settings, folder = task.settings, Path(out)
     for printer in task.printers:

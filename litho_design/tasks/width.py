@@ -1,5 +1,5 @@
 """The width of a design, i.e. how much different models disagree about the score of its layout. Uncorrected
-layouts, which are designed for a printer that prints nominal heights, are scored for comparison.
+layouts (see ``Task.untouched``) are scored for comparison.
 """
 
 from __future__ import annotations

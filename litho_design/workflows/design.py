@@ -42,8 +42,9 @@ class How(TypedDict, total=False):
 
     Attributes:
         judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of the
-            scores that these models predict is called the width of the design. By default, the judges are the
-            zoo's models that were trained on the same prints as the model of the design.
+            scores that the model of the design and the judges predict is called the width of the design. By
+            default, the judges are the zoo's models that were trained on the same prints as the model of the
+            design.
         robust: in the search, also use the judges that provide gradients. ``Task.over_models`` then combines
             the losses computed with the individual models, and a penalty on the disagreement of the models is
             added.
