@@ -117,7 +117,7 @@ missed = {name: first.height_um - own for name, own in prints.items()}
 show({name: 1e3 * (one - np.nanmedian(one)) for name, one in missed.items()}, "RdBu_r", vmin=-150, vmax=150)
 
 # %% [markdown]
-# ## 9. What could be the cause: the change by each [knob of the virtual fab](../virtual_fab.md), in nm
+# ## 9. What could be the cause: changes by two [knobs of the virtual fab](../virtual_fab.md), in nm
 
 # %%
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job
