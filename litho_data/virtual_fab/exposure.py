@@ -4,7 +4,6 @@ galvo scanner and the write field are included.
 
 import numpy as np
 import scipy.ndimage
-import scipy.signal
 
 from litho_data.foundation import Array
 from litho_data.layouts.random_layout import random_layout
@@ -191,4 +190,6 @@ def _earlier_lines(dose: Array, pitch_um: float, decay_um: float) -> Array:
     The weights fall exponentially with the distance of these lines, with the decay length ``decay_um``.
     """
     memory = np.exp(-pitch_um / decay_um)
-    return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)
+    from scipy.signal import lfilter  # its import takes a second
+
+    return lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

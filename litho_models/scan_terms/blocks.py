@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
 
 from litho_data.foundation.errors import InputError
 
@@ -72,6 +71,8 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
         InputError: the blocks are too small for the buffer.
     """
     block_px, buffer_px = blocks.block_px, blocks.buffer_px
+    from scipy.ndimage import minimum_filter
+
     if block_px <= 2 * buffer_px:
         raise InputError("block_px", got=block_px, wanted=f"more than twice the buffer of {buffer_px} px")
     shift = np.random.default_rng(blocks.seed).integers(0, 2 * block_px, size=2)
