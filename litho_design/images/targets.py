@@ -184,16 +184,10 @@ def _chart(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Draw a 7 x 7 array of spots without the central one."""
-    picture = np.zeros_like(x)
-    for row in range(-3, 4):
-        for column in range(-3, 4):
-            if (row, column) != (0, 0):
-                # No pixel outside these rows and columns is near enough.
-                off_y, off_x = y[:, 0] - 0.11 * row, x[0] - 0.11 * column
-                rows, columns = (np.flatnonzero(np.abs(off) < 0.016) for off in (off_y, off_x))
-                near = np.hypot(off_y[rows, None], off_x[columns]) < 0.016
-                picture[rows[:, None], columns] = near
-    return picture
+    row, column = (np.round(at / 0.11) for at in (y, x))
+    in_spot = np.hypot(y - 0.11 * row, x - 0.11 * column) < 0.016
+    drawn = (np.maximum(np.abs(row), np.abs(column)) <= 3) & ((row != 0) | (column != 0))
+    return (in_spot & drawn).astype(x.dtype)
 
 
 def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
