@@ -167,7 +167,7 @@ def run_app(app: typer.Typer, name: str) -> None:
         with running_command(command_line(name)), never_silent(name):
             words, files = without_plugins(given_words())
             load_plugins(files)
-            code = _command(app)(words, prog_name=name, standalone_mode=False)
+            code = app(words, prog_name=name, standalone_mode=False)
     except BrokenPipeError:
         # The program that reads the output, such as `head`, has closed the pipe. Unless stdout is redirected,
         # Python prints an error at exit.
@@ -184,12 +184,6 @@ def run_app(app: typer.Typer, name: str) -> None:
         raise SystemExit(code if isinstance(code, int) else 0)
     print(said, file=sys.stderr)
     raise SystemExit(2)
-
-
-@functools.cache
-def _command(app: typer.Typer) -> Callable[..., Any]:
-    """Return the command that typer makes of all functions of an application."""
-    return typer.main.get_command(app)
 
 
 def _not_allowed(error: Exception) -> InputError | None:

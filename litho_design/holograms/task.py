@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -91,24 +90,17 @@ class HologramTask(Task):
         }
         return figures | self._inside_window(seen)
 
-    @cached_property
-    def _starts(self) -> dict[tuple[float, ...], Tensor]:
-        """Cache of ``start_levels``. The uncorrected layout and the search may have the same start."""
-        return {}
-
     def start_levels(self, level_phase: Tensor) -> Tensor:
         """Return the levels whose printed phases are nearest to the phases that ``gerchberg_saxton`` finds.
         If the start is ``wgs``, the weighted form of the algorithm is used.
         """
-        search, asked = self.settings.search, tuple(level_phase.tolist())
-        if asked in self._starts:
-            return self._starts[asked]
+        search = self.settings.search
         phase, _ = gerchberg_saxton(
             self.bench.propagator, self.target, self.cells, self.bench.illumination(),
             iterations=_START_ITERATIONS, weighted=search.start == "wgs", seed=search.seed,
             level_phase=level_phase, counted=self.counted, total=self.total,
         )  # fmt: skip
-        return self._starts.setdefault(asked, nearest_levels(phase, level_phase))
+        return nearest_levels(phase, level_phase)
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
         """Return the score of the image behind a print, which is given as heights in µm of shape

@@ -519,15 +519,12 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         def residual(step: np.ndarray) -> np.ndarray:
             at = start.copy()
             at[columns] += step * unit[columns]
-            off = seen(image, at)
-            off -= off.mean()
-            off /= max(math.sqrt(np.square(off).mean()), 1e-12)
-            off -= target
-            off /= math.sqrt(alike)
+            one = seen(image, at)
+            off = (one - one.mean()) / max(float(one.std()), 1e-12) - target
             # These residuals express prior knowledge of scale and tilts.
             prior = [at[3] / pitch_sd] if 3 in columns and pitch_sd else []
             prior += [at[i] / _TILT_SD for i in (4, 5) if i in columns]
-            return np.append(off, prior)
+            return np.append(off.ravel() / math.sqrt(alike), prior)
 
         def slopes(step: np.ndarray) -> np.ndarray:
             # The derivatives use steps of half a pixel, because cv2 resolves positions only to 1/32 of a
