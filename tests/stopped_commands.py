@@ -55,7 +55,6 @@ from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.grouped import ALL
 from tests.figures import undrawn
-from tests.folders import copied
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import base_model, planted, search_little
 from tests.litho_models.prints import make_scans, write_store
@@ -351,7 +350,7 @@ def stop_everywhere(name: str, place: Path, *, every: bool = False) -> int:
     prepared.mkdir(parents=True)
     try:
         need(prepared)
-        whole, run = (copied(prepared, place / name) for name in ("whole", "run"))
+        whole, run = (Path(shutil.copytree(prepared, place / name)) for name in ("whole", "run"))
         count = writes_of(lambda: command(whole), whole)
         wanted = content(whole)
         assert wanted, "the command left nothing"

@@ -8,6 +8,7 @@ or removes something. A stopped process ends at once without clean-up, as if kil
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -15,8 +16,6 @@ from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
-
-from tests.folders import copied
 
 _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.link", "os.symlink"}
 _STOPPED = 77
@@ -35,7 +34,7 @@ def states_after(stops: Collection[int], work: Callable[[], object], below: Path
     """Run the work, and copy the folder ``below`` before each write that has one of the numbers ``stops``. A
     copy contains what a process leaves that is killed there: data that Python still buffers are missing.
     """
-    with _watched(below, lambda count: count in stops and copied(below, copies / f"{count}")):
+    with _watched(below, lambda count: count in stops and shutil.copytree(below, copies / f"{count}")):
         work()
     states = [copies / f"{stop}" for stop in stops]
     assert all(state.is_dir() for state in states), "the work made fewer writes"

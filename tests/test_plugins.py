@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
 from operator import methodcaller
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -67,16 +69,13 @@ class Number(int):
 def unknown(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Unload the plug-ins that a test has loaded, and what they have registered."""
     monkeypatch.setattr(plugins, "_LOADED", {})
+    monkeypatch.setattr(registry, "_READERS", [*registry._READERS])
+    monkeypatch.setattr(metric_registry, "_MEASUREMENTS", [*metric_registry._MEASUREMENTS])
     modules = set(sys.modules)
-    held = (
-        *(registry._READERS, registry._REGISTERED, task._TASKS, metric_registry._MEASUREMENTS),
-        *(MODELS, CATALOGUE, SCAN_TERMS),
-    )
-    before = [(own, own.copy()) for own in held]
-    yield
-    for own, entries in before:
-        own.clear()
-        own.update(entries) if isinstance(own, dict) else own.extend(entries)
+    with ExitStack() as held:
+        for registered in (registry._REGISTERED, task._TASKS, MODELS, CATALOGUE, SCAN_TERMS):
+            held.enter_context(patch.dict(registered))
+        yield
     for name in set(sys.modules) - modules:
         if name.startswith(("own_", "examples.own_")):
             del sys.modules[name]

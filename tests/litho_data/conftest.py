@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from litho_data.making.build import build_dataset
-from tests.folders import copied
 from tests.litho_data.campaigns import write_campaign
 
 
@@ -33,4 +33,4 @@ def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def own_campaign(campaign: Path, tmp_path: Path) -> Path:
     """Return a copy of ``campaign`` that a test may change or damage."""
-    return copied(campaign, tmp_path / "campaign")
+    return Path(shutil.copytree(campaign, tmp_path / "campaign"))

@@ -18,7 +18,6 @@ from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.partial import PartialStore, Piece
-from tests.folders import copied
 from tests.litho_data.campaigns import write_campaign
 
 
@@ -69,7 +68,7 @@ def test_an_import_begun_with_other_options_is_not_continued(
     other: dict[str, Any], begun: Path, tmp_path: Path, without_report: None
 ) -> None:
     """Check this because continuing such an import would mix fields with two pitches in one store."""
-    own = copied(begun, tmp_path / "own")
+    own = shutil.copytree(begun, tmp_path / "own")
     result = import_pairs(own / "pairs", own / "mixed.zarr", **other)
     assert result.reused == 0
     assert not verify(own / "mixed.zarr").findings
@@ -78,7 +77,7 @@ def test_an_import_begun_with_other_options_is_not_continued(
 def test_an_import_begun_with_the_same_options_is_continued(
     begun: Path, tmp_path: Path, without_report: None
 ) -> None:
-    own = copied(begun, tmp_path / "own")
+    own = shutil.copytree(begun, tmp_path / "own")
     assert import_pairs(own / "pairs", own / "mixed.zarr").reused == 2
 
 
