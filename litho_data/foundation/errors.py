@@ -16,8 +16,8 @@ class InputError(ValueError):
     and may add a hint.
 
     All commands print the message without a traceback and exit with code 2. Every other exception is a defect
-    of this project. If ``got`` is an exception, the message states the cause of this exception in plain
-    words.
+    of this project, unless the system caused it, for example a full disk. If ``got`` is an exception, the
+    message states the cause of this exception in plain words.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):

@@ -1,4 +1,4 @@
-"""Estimate the white noise of a measured map, and the uncertainties of the scores of a measurement."""
+"""Estimate the white noise of a measured map, and the uncertainty of scores that are computed from it."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
     """Return the probability that a rise of the mean is noticed, i.e. raises an alarm within ``SOON`` prints.
-    If there are fewer new prints than that, the alarm must come within these prints.
+    If there are fewer than ``SOON`` new prints, the alarm must come within the new prints.
 
     The result is a lower bound, because only one comparison is considered: the step is assumed at the first
     print after the rise. The statistic of this comparison has a noncentral t distribution. All values are
