@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, fit_state, without_terms
+from litho_models.loop.fits import State, fit_state
 from litho_models.loop.judging import judge_states
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screened, Screening, Secants
@@ -166,7 +166,7 @@ def reshaped_gain(without: State, state: State) -> float:
     before, after = (one.maps_um(study.windows) for one in (without, state))
     for window, left, own, other in zip(study.windows, state.held_out_um, after, before, strict=True):
         maps = _shapes(own - other, own, window)
-        freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
+        freed = window.freed(np.column_stack([left, *map(window.at_sample, maps)]), own)
         grams.append(freed.T @ freed / len(freed))
     # The last argument of ``Block`` is the weight of the prior that no variant is present, stated as a number
     # of scans. Without this prior, the many parameters would fit the noise of the few scans.

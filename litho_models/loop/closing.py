@@ -18,7 +18,6 @@ from typing import Any
 from torch import nn
 
 from litho_data.commands.progress import estimate
-from litho_data.store import PrintedScan
 from litho_models.effects import get_effect, screened_effects
 from litho_models.effects.films import FILM_LAWS
 from litho_models.effects.laws import LAWS, TABLES
@@ -27,7 +26,7 @@ from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import SMALLEST_SHARE, judge_states
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import Stage
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
@@ -141,7 +140,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         plain[name] = fit_state(Twin.bare(base), study)
     study.report("fitting the measurement errors that groups of scans share")
     nearest = min(plain.values(), key=lambda state: state.mse_nm2)
-    freed = replace(study, scans=prepare_scans(freed_scans(nearest)))
+    freed = replace(study, scans=freed_scans(nearest))
     excluded = untestable(freed)
     candidates = [
         one
@@ -225,7 +224,7 @@ def _rest_beside(start: State) -> Callable[[State], Rest]:
     return cache(lambda state: learner().rest(state.maps_um(scans)))
 
 
-def freed_scans(state: State) -> list[PrintedScan]:
+def freed_scans(state: State) -> list[PreparedScan]:
     """Subtract from each scan the measurement errors that all scans of its group have in common. Return the
     corrected scans.
 
@@ -233,14 +232,14 @@ def freed_scans(state: State) -> list[PrintedScan]:
     The errors to subtract from a scan are learned from the scans outside its fold.
     """
     study = state.study
-    maps, scans, freed = state.maps_um(study.scans), study.stored, study.stored
+    maps, scans, freed = state.maps_um(study.scans), study.stored, [*study.scans]
     for own, held_out in study.folds:
         if len(own) < 2:
             continue
         learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
         differences = learned.between_groups()
         for i in held_out:
-            freed[i] = differences.freed(scans[i], maps[i])
+            freed[i] = replace(freed[i], stored=differences.freed(scans[i], maps[i]))
     return freed
 
 

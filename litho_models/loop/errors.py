@@ -4,19 +4,21 @@ and a measurement model (of the microscope) is fitted together with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES, State, Study, TwinProblem
-from litho_models.loop.model import Twin, is_refitted
+from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.loop.record import ErrorRow, Stage
 from litho_models.scan_terms import Blocks, Policy
@@ -24,12 +26,12 @@ from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.measurement_fit import learn_measurement
 from litho_models.scoring.noise_floor import freed_by_policy
-from litho_models.scoring.records import Prediction
 from litho_models.scoring.shapes import edges_of_scan
 from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
 Maps = list[np.ndarray]
+Nested = Literal["folds", "prints"]
 
 
 class Fit(NamedTuple):
@@ -63,8 +65,10 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
     maps = [*map(twin.height, scans)]
     measurement = learn_measurement(stored, maps, seed=seed)
     if refit and len(twin.vector):
-        freed = [*map(measurement.freed, stored, maps)]
-        windows = [scan.window for scan in prepared_among(freed, scans)]
+        freed = map(measurement.freed, stored, maps)
+        # The scans are numbered anew, so that their windows again cover all quadrants of the field evenly.
+        numbered = enumerate(zip(scans, freed, strict=True))
+        windows = [replace(scan, stored=own, number=at).window for at, (scan, own) in numbered]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
         maps = [*map(twin.height, scans)]
         measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
@@ -129,8 +133,7 @@ class HeldOut:
 
     def __init__(self, study: Study):
         self.study, self.scans = study, study.stored
-        self._by_fold = cache(self._without_folds)
-        self.fit = cache(lambda state: fit_with_measurement(state.twin, study.scans, study.seed))
+        self._by_fold, self.fit = cache(self._without_folds), cache(self._to_all)
 
     def errors(self, closed: Closed) -> list[ErrorRow]:
         """Return the errors of three models of a loop: the base model, the base model with the causes, and
@@ -153,7 +156,7 @@ class HeldOut:
                 self.study.report(f"scoring the model: {name}")
                 rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]
-        if 1 < len(set(prints)) < len(prints) and is_refitted(closed.base.twin.base):
+        if 1 < len(set(prints)) < len(prints) and closed.base.twin.own:
             for name, state in closed.ends.items():
                 self.study.report(f"leaving out whole prints: {name}")
                 starts = dict.fromkeys(sorted(set(prints)), state.twin)
@@ -166,9 +169,10 @@ class HeldOut:
         """
         return self._by_fold(state)[0]
 
-    def left_out_nm(self, model: State) -> dict[str, float]:
+    def left_out_nm(self, closed: Closed) -> dict[str, float]:
         """Return the increase of the headline error (see ``ErrorRow.is_headline``), nm, when an effect is
-        removed from a model and the model is refitted. The result is keyed by the name of the effect.
+        removed from the corrected model and the model is refitted. The result is keyed by the name of the
+        effect.
 
         After this refit, the measurement model is fitted again, while the parameters of the printer model are
         held fixed.
@@ -179,7 +183,7 @@ class HeldOut:
             rows = self._rows(*self._by_fold(state, refit=False), "all")
             return next(row.leading_nm for row in rows if row.is_headline)
 
-        found = {}
+        found, model = {}, closed.final
         for name in model.twin.names:
             self.study.report(f"leaving out {name}")
             found[name] = error_nm(model.without(name)) - error_nm(model)
@@ -187,6 +191,9 @@ class HeldOut:
 
     def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
         return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)
+
+    def _to_all(self, state: State) -> Fit:
+        return fit_with_measurement(state.twin, self.study.scans, self.study.seed)
 
     def _without_folds(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
         return self._without_parts(dict(enumerate(state.per_fold)), self.study.fold_of.tolist(), refit)
@@ -220,7 +227,7 @@ class HeldOut:
             heights = [twin.height(self.study.scans[i]) for i in rest]
             learned = learn_background([self.scans[i] for i in rest], heights)
             for i in own:
-                found[i] = Prediction.beside(learned, self.scans[i], maps[i]).map_um
+                found[i] = maps[i] + learned.of_scan(self.scans[i])
         return found
 
 
@@ -256,3 +263,27 @@ def errors_of_others(
         own = [known[scan.id] for scan in scans]
         rows += error_rows(scans, own, numbers[stage], seed, model=stage, held_out=held_out)
     return rows
+
+
+def nested_errors(
+    study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
+) -> list[ErrorRow]:
+    """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
+    print), and score its result on the scans that were left out. Return the errors on all scans.
+    """
+    scans = study.stored
+    parts = study.fold_of.tolist() if nested == "folds" else [scan.print_id for scan in scans]
+
+    def anew() -> Iterator[tuple[HeldOut, Closed, list[PrintedScan]]]:
+        numbered = enumerate(progress(sorted(set(parts)), "repeating all choices"), 1)
+        for number, part in numbered:
+            used, out = (
+                [scan for scan, own in zip(scans, parts, strict=True) if (own == part) == left_out]
+                for left_out in (False, True)
+            )
+            names = ", ".join(scan.id for scan in out)
+            study.report(f"leaving out {names} and repeating all choices ({number} of {len(set(parts))})")
+            closed = close_again(used)
+            yield HeldOut(closed.given), closed, out
+
+    return errors_of_others(anew(), scans, f"nested {nested}", study.seed)

@@ -29,16 +29,10 @@ from litho_models.fitting.least_squares import (
     with_residuals,
 )
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import PreparedScan, prepare_scans
-from litho_models.scan_terms import Terms
+from litho_models.loop.prepared import FREE_TERMS, PreparedScan, prepare_scans
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.splits.folds import grouped_folds
 
-# Terms that are fitted freely to each scan when a model is fitted. The gain is not one of them, because it
-# also depends on long-range effects of the printer.
-FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
-# Terms that are fitted freely to each scan when the errors of models are compared.
-ALL_FREE: Terms = FREE_TERMS | {"gain"}
 RULES = Rules("squares", steps=24, kept_above=0.8)
 
 
@@ -243,10 +237,7 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     ]
     maps = [per_fold[fold].height(one) for fold, one in zip(study.fold_of, windows, strict=True)]
     held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
-    freed = [
-        without_terms(left[:, None], window, own)[:, 0]
-        for left, window, own in zip(held_out, windows, maps, strict=True)
-    ]
+    freed = [one.freed(left, own) for one, left, own in zip(windows, held_out, maps, strict=True)]
     return State(study, common, per_fold, linear, held_out, freed)
 
 
@@ -267,21 +258,6 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     some = TwinProblem(twin, windows[::3] if len(windows) > 6 else windows)
     fits = [fit_least_squares(some, start, RULES) for start in (twin.vector, unfitted)]
     return min(fits, key=lambda fit: eliminated_sum(fit.linear, RULES.term_weight)[2]).vector
-
-
-def without_terms(
-    columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
-) -> np.ndarray:
-    """Project the free terms of a scan out of the given columns.
-
-    Args:
-        columns: m columns of values at the n sampled pixels of the scan, of shape (n, m).
-        window: the scan.
-        prediction_um: predicted height from which the terms are computed, µm, of shape (ny, nx).
-        terms: names of the free terms.
-    """
-    basis = window.free_basis(prediction_um, terms)
-    return columns - basis @ (basis.T @ columns)
 
 
 def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:

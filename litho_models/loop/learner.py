@@ -19,9 +19,9 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.least_squares import gram, orthonormal
 from litho_models.fitting.ridge import feature_rows
-from litho_models.loop.fits import ALL_FREE, Study
+from litho_models.loop.fits import Study
 from litho_models.loop.judging import SMALLEST_SHARE
-from litho_models.loop.prepared import PreparedScan, sample_border_px
+from litho_models.loop.prepared import ALL_FREE, PreparedScan, sample_border_px
 from litho_models.models.features import Features, RandomFeaturesConfig
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval

@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import find_objects, label
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.store import PrintedScan, Store
 from litho_models.loop.judging import CONFIRM_P
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ScanFinding
@@ -27,7 +29,7 @@ def with_marks(
     findings: Sequence[ScanFinding],
     scans: Sequence[PreparedScan],
     maps_um: Sequence[np.ndarray],
-    rounding_um: Sequence[float],
+    steps_um: Sequence[float],
 ) -> list[ScanFinding]:
     """Return the findings about per-scan terms together with the findings about marks.
 
@@ -36,12 +38,21 @@ def with_marks(
             scans that the registration has straightened is added to this finding.
         scans: the original scans.
         maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
-        rounding_um: rounding step of the heights in the raw file of each scan, µm; empty if there are no raw
-            files.
+        steps_um: rounding step of the heights in the raw file of each scan, as ``rounding_um`` returns it.
     """
     found = [_with_bends(one, scans) if one.name == "registration-residual" else one for one in findings]
     found.append(_scars(scans, maps_um))
-    return [*found, _rounding(rounding_um)] if rounding_um else found
+    return [*found, _rounding(steps_um)] if steps_um else found
+
+
+def rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
+    """Return the rounding step of the heights in the raw file of each scan, µm. The list is empty if the
+    store has no raw files.
+    """
+    try:
+        return [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
+    except InputError:
+        return []
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:

@@ -14,7 +14,6 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import without_terms
 from litho_models.loop.record import Planted
 
 
@@ -58,8 +57,7 @@ def plant(
         here = twin.height(scan)
         added = twin.height(scan, values) - here
         changed.append(replace(scan.stored, height_um=scan.stored.height_um + added.astype(np.float32)))
-        freed = without_terms(scan.at_sample(added)[:, None], scan, here)
-        squares.append(float(np.mean(freed**2)))
+        squares.append(float(np.mean(scan.freed(scan.at_sample(added), here) ** 2)))
     again = close_again(changed)
     causes = filter(again.needed_by_all, again.named.causes)
     cause = next((one for one in causes if effect.name in (one.name, *one.alike)), None)

@@ -19,6 +19,11 @@ from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan
 from litho_models.scan_terms.blocks import thinned
 from litho_models.splits.folds import Crop
 
+# Terms that are fitted freely to each scan when a model is fitted. The gain is not one of them, because it
+# also depends on long-range effects of the printer.
+FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
+# Terms that are fitted freely to each scan when the errors of models are compared.
+ALL_FREE: Terms = FREE_TERMS | {"gain"}
 # If both sides of a scan have at least this length, fits and screening use only one quadrant of the scan. The
 # quadrant is predicted with a margin.
 LARGE_PX = 400
@@ -155,7 +160,15 @@ class PreparedScan:
         """Return an orthonormal basis of the named scan terms at the sampled pixels. The terms are computed
         from a predicted height, µm, of shape (ny, nx). The result has shape (n, k).
         """
-        return orthonormal(self.terms_at_sample(prediction_um, terms).T)
+        maps = self.terms_at_sample(prediction_um, terms)
+        return orthonormal(maps.T)
+
+    def freed(self, values: np.ndarray, prediction_um: np.ndarray) -> np.ndarray:
+        """Project all free terms out of values at the n sampled pixels. The terms are computed from a
+        predicted height, µm, of shape (ny, nx). The values and the result have shape (n,) or (n, m).
+        """
+        basis = self.free_basis(prediction_um, ALL_FREE)
+        return values - basis @ (basis.T @ values)
 
 
 def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:

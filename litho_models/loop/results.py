@@ -68,9 +68,6 @@ def record(
         base_values=_values(closed.base.twin),
         corrected_values=_values(final),
         errors=errors,
-        gain_nm=float(np.mean(gains)),
-        over_scans=over_units(gains, seed=study.seed),
-        over_prints=over_prints(gains, prints, study.seed),
         effects=effects,
         candidates=_candidates(closed, effects, {one.name for one in single_scans}),
         single_scans=single_scans,
@@ -85,6 +82,9 @@ def record(
         ],
         verdict=_verdict(closed, effects),
         fewest_scans=FEWEST_SCANS,
+        gain_nm=float(np.mean(gains)),
+        over_scans=over_units(gains, seed=study.seed),
+        over_prints=over_prints(gains, prints, study.seed),
     )
 
 
@@ -121,7 +121,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     # If the search with another base does not find a cause, the cause may only correct an error of the chosen
     # base.
     unsure = effect.knowledge == "cause" and cause.role is None
-    corrects = unsure and not closed.needed_by_all(cause)
+    corrects, on = unsure and not closed.needed_by_all(cause), survives_on(cause, closed.rivals)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
     unnamed: EffectVerdict = "confusable" if cause.alike else "explained"
     return FoundEffect(
@@ -141,7 +141,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
         family_p=cause.family_p,
         group_p=cause.group_p,
         left_out_nm=left_out_nm,
-        survives_on=survives_on(cause, closed.rivals),
+        survives_on=on,
     )
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
@@ -22,20 +21,19 @@ from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
-from litho_models.loop.errors import HeldOut, errors_of_others
+from litho_models.loop.errors import HeldOut, Nested, errors_of_others, nested_errors
 from litho_models.loop.fits import Study
-from litho_models.loop.marks import rounding_step_um, with_marks
+from litho_models.loop.marks import rounding_um, with_marks
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
-from litho_models.loop.record import CloseLoop, Decision, ErrorRow, ScanFinding
+from litho_models.loop.record import CloseLoop, Decision, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.single_scans import SingleScans
 from litho_models.simulator import Simulator
-from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
+from litho_models.splits.folds import GROUPED_FOLDS, Split
 
 MODEL_FOLDER, QUESTIONS_FILE = "model", "open_questions.json"
-Nested = Literal["folds", "prints"]
 # A function that receives a closed loop and its findings about per-scan terms. It returns the loop, which it
 # may have changed, the decisions on open questions, and a list of further records to write.
 Further = Callable[[Closed, Sequence[ScanFinding]], tuple[Closed, list[Decision], Sequence[Result]]]
@@ -123,6 +121,8 @@ def close_loop(
             raise InputError(
                 f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
             )
+        if nested == "prints" and len({scan.print_id for scan in development}) < 2:
+            raise InputError("--nested prints", got="scans of one print", wanted="scans of at least 2 prints")
         closed = close(study, bases)
 
         def close_again(scans: Sequence[PrintedScan], named: Collection[str] = bases.keys()) -> Closed:
@@ -134,14 +134,14 @@ def close_loop(
             report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
             terms = SingleScans(study, maps).findings()
-            alone = with_marks(terms, study.scans, maps, _rounding_um(opened, development))
+            alone = with_marks(terms, study.scans, maps, rounding_um(opened, development))
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
-        errors, left_out_nm = models.errors(closed), models.left_out_nm(closed.final)
-        planted = [plant(*one, closed, close_again) for one in wanted]
+        errors, left_out_nm = models.errors(closed), models.left_out_nm(closed)
         if nested:
-            errors += _nested(study, nested, partial(close_again, named=[closed.base_name]))
+            errors += nested_errors(study, nested, partial(close_again, named=[closed.base_name]))
         if open_lock_box and locked:
             errors += errors_of_others([(models, closed, locked)], locked, "locked", seed)
+        planted = [plant(*one, closed, close_again) for one in wanted]
         result = record(
             closed,
             errors,
@@ -170,39 +170,6 @@ def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
     few = [scan.id for scan in scans if np.count_nonzero(scan.usable) < FEWEST_PIXELS]
     usable = [scan for scan in scans if scan.id not in few]
     return usable, [f"{one}: fewer than {FEWEST_PIXELS} measured pixels" for one in few]
-
-
-def _nested(
-    study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
-) -> list[ErrorRow]:
-    """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
-    print), and score its result on the scans that were left out. Return the errors on all scans.
-    """
-    scans = study.stored
-    ids = [scan.id for scan in scans]
-    parts = (
-        [[ids[i] for i in own] for _, own in study.folds]
-        if nested == "folds"
-        else leave_one_print_out(ids, [scan.print_id for scan in scans])
-    )
-
-    def anew() -> Iterator[tuple[HeldOut, Closed, list[PrintedScan]]]:
-        for number, out in enumerate(progress(parts, "repeating all choices"), 1):
-            study.report(f"leaving out {', '.join(out)} and repeating all choices ({number} of {len(parts)})")
-            closed = close_again([scan for scan in scans if scan.id not in out])
-            yield HeldOut(closed.given), closed, [scan for scan in scans if scan.id in out]
-
-    return errors_of_others(anew(), scans, f"nested {nested}", study.seed)
-
-
-def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the rounding step of the heights in the raw file of each scan, µm. The list is empty if the
-    store has no raw files.
-    """
-    try:
-        return [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
-    except InputError:
-        return []
 
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:

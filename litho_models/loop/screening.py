@@ -22,10 +22,10 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect
 from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import gram_inside
-from litho_models.loop.fits import ALL_FREE, State
+from litho_models.loop.fits import State
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.prepared import ALL_FREE, PreparedScan
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 

@@ -24,9 +24,9 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store.schema import DatasetId, Instrument, Surround
 from litho_models.effects.chain import Frame
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
-from litho_models.loop.fits import ALL_FREE, RULES, TwinProblem
+from litho_models.loop.fits import RULES, TwinProblem
 from litho_models.loop.model import Added, Twin
-from litho_models.loop.prepared import PreparedScan, sample_border_px
+from litho_models.loop.prepared import ALL_FREE, PreparedScan, sample_border_px
 from litho_models.loop.run import QUESTIONS_FILE
 from litho_models.scan_terms import freed_um
 from litho_models.scan_terms.grouped import ALL

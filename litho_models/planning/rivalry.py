@@ -26,9 +26,9 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import FieldContext
 from litho_models.effects.chain import EffectChain, Fields
 from litho_models.fitting.least_squares import Linearised, eliminated_sum, orthonormal, solve_damped
-from litho_models.loop.fits import ALL_FREE, RULES
+from litho_models.loop.fits import RULES
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import sample_border_px
+from litho_models.loop.prepared import ALL_FREE, sample_border_px
 from litho_models.planning.questions import NoiseSpectrum, Question
 from litho_models.scan_terms import TermPixels, term_maps
 from litho_models.simulator import Simulator

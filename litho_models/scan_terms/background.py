@@ -25,6 +25,9 @@ from litho_models.scan_terms.term import FloatMap, smooth_shapes
 # by 2 %.
 _SAME_SIZE = 0.01
 
+# A pair consists of a scan and the predicted height of its print, µm, of shape (ny, nx).
+Pair = tuple[PrintedScan, np.ndarray]
+
 
 @dataclass(frozen=True, repr=False)
 class ScanPart(PrintedScan):
@@ -64,6 +67,12 @@ class Background(Record):
         coefficients = (self.x_nm, self.y_nm, self.xx_nm, self.xy_nm, self.yy_nm)
         return np.tensordot(coefficients, smooth_shapes(shape), axes=1) / NM_PER_UM
 
+    def of_scan(self, scan: PrintedScan) -> FloatMap:
+        """Return the background at the pixels of a scan, µm, of shape (ny, nx). It is zero if the field of
+        the scan has another size.
+        """
+        return on_field(scan, self.map_um) if self.fits(scan) else np.zeros(scan.shape)
+
 
 def field_um(scan: PrintedScan) -> tuple[float, float]:
     """Return the size (y, x) of a scan's field, µm. For a part, this is the size of the whole field."""
@@ -82,9 +91,15 @@ def on_field(scan: PrintedScan, maps: Callable[[tuple[int, int]], FloatMap]) -> 
     return maps(scan.whole)[..., top : top + ny, left : left + nx]
 
 
-def usual_field_um(scans: Sequence[PrintedScan]) -> tuple[float, float]:
-    """Return the most frequent size (y, x) of the scans' fields, µm."""
-    return Counter(map(field_um, scans)).most_common(1)[0][0]
+def of_usual_size(
+    scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]
+) -> tuple[tuple[float, float], list[Pair]]:
+    """Return the most frequent size (y, x) of the scans' fields, µm, and those of the scans whose fields have
+    this size, each with the predicted height of its print.
+    """
+    usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
+    pairs = zip(scans, predictions_um, strict=True)
+    return usual_um, [pair for pair in pairs if is_of_size(pair[0], usual_um)]
 
 
 def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
@@ -106,12 +121,8 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
         predictions_um: height that the model predicts for each scan, µm, as a map of shape (ny, nx). The maps
             are in the order of ``scans``.
     """
-    usual_um = usual_field_um(scans)
-    pairs = [
-        one
-        for one in zip(scans, predictions_um, strict=True)
-        if is_of_size(one[0], usual_um) and one[0].usable.any()
-    ]
+    usual_um, pairs = of_usual_size(scans, predictions_um)
+    pairs = [pair for pair in pairs if pair[0].usable.any()]
     products, seen = np.zeros((5, 5)), np.zeros(5)
     for scan, prediction in pairs:
         usable = scan.usable

@@ -13,7 +13,7 @@ import numpy as np
 
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
-from litho_models.scan_terms.background import usual_field_um
+from litho_models.scan_terms.background import Pair, of_usual_size
 from litho_models.scan_terms.blocks import thinned
 from litho_models.scan_terms.cross_fit import least_squares
 from litho_models.scan_terms.grouped import ALL, Block, Products, groupings
@@ -59,10 +59,6 @@ _ROUNDS = 2
 _INNER_FOLDS = 5
 
 
-# A pair consists of a scan and the predicted height of its print, of shape (ny, nx).
-_Pair = tuple[PrintedScan, np.ndarray]
-
-
 def learn_measurement(
     scans: Sequence[PrintedScan],
     predictions_um: Sequence[np.ndarray],
@@ -85,10 +81,10 @@ def learn_measurement(
         like: an earlier measurement model. If it is given, its levelling and parts are used, and only the
             coefficients of these parts are fitted again.
     """
-    model = MeasurementModel(levelling="none", parts=[], field_um=usual_field_um(scans), scans=0)
+    usual_um, pairs = of_usual_size(scans, predictions_um)
+    model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     if scans[0].seen_by == "sem":
         return model
-    pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]
     levelling = like.levelling if like else _best_levelling(pairs)
     model = model.model_copy(update={"levelling": levelling, "scans": len(pairs)})
     chosen = like.parts if like else []
@@ -102,7 +98,7 @@ def learn_measurement(
     return model
 
 
-def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
+def _products(pairs: Sequence[Pair], model: MeasurementModel) -> Products:
     """Return, for each scan, the inner products between the residual and the columns (regressors) of all
     parts that may be tried. The columns are computed by linearisation at the current measurement model.
     """
@@ -195,7 +191,7 @@ def _block(part: SharedPart) -> Block:
     return Block(tuple(range(start, start + count)), part.by, part.shrinking)
 
 
-def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
+def _best_levelling(pairs: Sequence[Pair]) -> Levelling:
     """Choose the levelling with which the predictions fit the scans best. The bow and tilt that all scans
     share are first removed.
     """

@@ -15,7 +15,7 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.schema import Instrument
 from litho_models.scan_terms import Policy
-from litho_models.scan_terms.background import Background, on_field
+from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.statistics import Interval, OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
@@ -40,7 +40,7 @@ class Prediction(NamedTuple):
         """
         if background is None or not background.fits(scan):
             return cls(height_um)
-        return cls(height_um, on_field(scan, background.map_um))
+        return cls(height_um, background.of_scan(scan))
 
     @classmethod
     def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import get_effect
-from litho_models.loop.fits import TwinProblem, fit_state, without_terms
+from litho_models.loop.fits import TwinProblem, fit_state
 from litho_models.loop.model import Slot, Twin, Values
 from litho_models.loop.prepared import LARGE_PX, prepare_scans, prepared_among
 from litho_models.loop.results import clustered_covariance
@@ -192,7 +192,7 @@ def test_free_errors_are_those_of_the_fit_that_has_not_seen_the_scan(study) -> N
         prediction = state.per_fold[fold].height(scan)
         left = scan.height - scan.at_sample(prediction)
         np.testing.assert_allclose(state.held_out_um[at], left, atol=1e-12)
-        freed = without_terms(left[:, None], scan, prediction)
+        freed = scan.freed(left, prediction)
         assert state.freed_nm2[at] == pytest.approx(1e6 * np.mean(freed**2))
 
 

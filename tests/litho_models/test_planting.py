@@ -12,7 +12,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.loop.closing import Closed, _rest_beside
-from litho_models.loop.fits import fit_state, without_terms
+from litho_models.loop.fits import fit_state
 from litho_models.loop.model import Twin
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.search import search
@@ -46,7 +46,7 @@ def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they
         bare, there = closed.base.twin, {"": {"strength": 0.04}}
         here = bare.height(scan)
         change = bare.with_effect(LAW, "all", there).height(scan) - here
-        changes.append(np.mean(without_terms(scan.at_sample(change)[:, None], scan, here) ** 2))
+        changes.append(np.mean(scan.freed(scan.at_sample(change), here) ** 2))
     assert large.rms_nm == pytest.approx(NM_PER_UM * np.sqrt(np.mean(changes)), rel=1e-4)
 
 
