@@ -71,8 +71,12 @@ def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> 
 
     T is an analytic function of l, and T = 1 at l = 0. For small pixels, T approaches 1 / (1 + i 2π f l).
     """
-    difference = 1 - torch.exp(-2j * math.pi * frequency * pitch_um)
-    return 1 / (1 + length_um / pitch_um * difference)
+    # T = 1 / (1 + a (1 - e^(-iθ))) in real numbers, which takes a tenth of the time of complex ones.
+    pixels, half = length_um / pitch_um, math.pi * pitch_um * frequency
+    sine = half.sin()
+    real, imaginary = 1 + 2 * pixels * sine**2, 2 * pixels * sine * half.cos()
+    squared = real**2 + imaginary**2
+    return torch.complex(real / squared, -imaginary / squared)
 
 
 def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
