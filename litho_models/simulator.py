@@ -177,6 +177,16 @@ class Simulator(nn.Module, ABC):
         return {}
 
     @property
+    def values(self) -> dict[str, Tensor]:
+        """Return the physical values of those parameters that are single numbers, keyed by name."""
+        ranges, found = self.ranges, dict[str, Tensor]()
+        for key, raw in self.named_parameters():
+            if raw.numel() == 1:
+                own = ranges.get(key)
+                found[own.name if own else key] = own.value(raw) if own else raw
+        return found
+
+    @property
     def at_bounds(self) -> dict[str, float]:
         """Return the physical values that lie on a bound of their range, as a dict from the name of the value
         to the bound.

@@ -100,18 +100,12 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the fitted values of the parameters of the base model, keyed by name. Arrays of parameters are
-    left out. A parameter with a range is converted from its raw number to the physical value (see
-    ``layers.ranges``). The result is empty if the base model was not fitted.
+    """Return the fitted values of the parameters of the base model that are single numbers, keyed by name.
+    The result is empty if the base model was not fitted.
     """
-    base, found = twin.fitted_base, {}
-    if twin.own and isinstance(base, Simulator):
-        for name, parameter in base.named_parameters():
-            if parameter.numel() == 1:
-                known = base.ranges.get(name)
-                value = known.value(parameter) if known else parameter
-                found[known.name if known else name] = value.item()
-    return found
+    base = twin.fitted_base
+    known = base.values if twin.own and isinstance(base, Simulator) else {}
+    return {name: value.item() for name, value in known.items()}
 
 
 def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:

@@ -150,14 +150,6 @@ class Physics(Simulator):
         return widths[0], widths[-1]
 
     @property
-    def values(self) -> dict[str, Tensor]:
-        """Return the physical values by name: alpha, eta, kappa_min, sigma_diffusion_um and bias_um and, if
-        they are fitted, the gain and the widths of the spot.
-        """
-        ranged = {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
-        return {**ranged, "bias_um": self.bias_um}
-
-    @property
     def reach_px(self) -> int | None:
         if self.config.shrinkage != "fixed-reference":
             return None

@@ -87,11 +87,6 @@ class Printer(Simulator):
         }
 
     @property
-    def values(self) -> dict[str, Tensor]:
-        """Return the values of the fitted parameters, keyed by names of the form ``part.parameter``."""
-        return {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
-
-    @property
     def reach_px(self) -> int:
         return sum(part.reach_px(values, self.pitch_um) for part, values in self._chain())
 

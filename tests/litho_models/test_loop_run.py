@@ -23,9 +23,9 @@ from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze
-from litho_models.loop import bases, closing, run
+from litho_models.loop import bases, closing
 from litho_models.loop.closing import Closed, close, freed_scans
-from litho_models.loop.errors import REPORTED, HeldOut, error_rows
+from litho_models.loop.errors import REPORTED, HeldOut, error_rows, nested_errors
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
@@ -330,14 +330,14 @@ def test_a_scan_is_freed_by_what_the_others_say() -> None:
     bowed = with_heights(scans, [s.height_um + bow for s, bow in zip(scans, bows, strict=True)])
     study = study_of(bowed)
     state = bare_state(study)
-    freed = freed_scans(state)
+    freed = [one.stored for one in freed_scans(state)]
     taken = [one.height_um - other.height_um for one, other in zip(bowed, freed, strict=True)]
     # Each field gets half of the difference between the fields, reduced by shrinkage.
     for scan, own in zip(bowed, taken, strict=True):
         sign = 1 if scan.groups["field"] == "2" else -1
         assert np.corrcoef(own.ravel(), sign * _bow(scan.shape).ravel())[0, 1] > 0.9
     other = [replace(bowed[0], height_um=bowed[0].height_um + _bow(bowed[0].shape)), *bowed[1:]]
-    again = freed_scans(replace(state, study=study_of(other)))
+    again = [one.stored for one in freed_scans(replace(state, study=study_of(other)))]
     np.testing.assert_allclose(other[0].height_um - again[0].height_um, taken[0], atol=1e-6)
     assert np.abs(other[1].height_um - again[1].height_um - taken[1]).max() > 1e-4
 
@@ -441,7 +441,7 @@ def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
 
     made = planted([(law, ALL, {"": {"strength": 0.05}})], count=12)
     scans = [replace(scan, print_id=str(number // 4)) for number, scan in enumerate(made)]
-    rows = run._nested(study_of(scans), "prints", watched)
+    rows = nested_errors(study_of(scans), "prints", watched)
     assert seen == [{"1", "2"}, {"0", "2"}, {"0", "1"}]
     # Every selection chooses the law, which also reduces the error on the held-out print.
     assert chosen == [(law,)] * 3
