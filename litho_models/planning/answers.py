@@ -14,11 +14,10 @@ import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.judging import CONFIRM_P
 from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Question
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
-from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
+from litho_models.planning.rivalry import Contrast, Print, Rivalry, linearised
 
 # A difference of this many standard deviations decides between two rivals. It corresponds to ``CONFIRM_P``,
 # the largest allowed probability of naming a wrong cause.
@@ -39,18 +38,14 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     """Return the power of an experiment with the given number of prints to decide between two rivals. These
     prints are assumed to be like the prints for which the contrast was computed.
 
-    The decision compares the squared errors of the two rivals. If one rival is true, the expected difference
-    of the squared errors is the squared distance between the two predictions. The actual difference varies
-    about this value for two reasons. One reason is the noise, projected onto the difference of the
-    predictions. The other reason is that the squared distance varies between prints, with the relative spread
-    ``question.spread``. A part of the difference may come from inexact formulas of the model, whose error is
-    at most ``question.form_nm``. This part is subtracted, as in the decision itself.
+    The decision compares the squared errors of the two rivals (see ``surely_better``). If one rival is true,
+    the expected difference of the squared errors is the squared distance between the two predictions. The
+    noise in this difference is the noise of the scans, projected onto the difference of the predictions.
     """
-    squares = prints * float(contrast.squares_um2.mean())
-    noise = prints * float((contrast.sd_um2**2).mean())
-    form = prints * float(contrast.pixels.mean()) * ((question.form_nm or 0.0) / NM_PER_UM) ** 2
-    sd = math.sqrt(noise + (question.spread * squares) ** 2 / prints)
-    return float(norm.cdf(surely_better(squares, squares, sd, form) - Z_DECIDED))
+    squares = prints * float(contrast.squares_nm2.mean())
+    noise = prints * float((contrast.sd_nm2**2).mean())
+    z = surely_better(question, squares, squares, noise, prints, prints * contrast.pixels)
+    return float(norm.cdf(z - Z_DECIDED))
 
 
 def of_repeats(prints: int, scans: int) -> float:
@@ -86,16 +81,13 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
     return float(norm.cdf(z - Z_DECIDED))
 
 
-def prints_needed(powers: Sequence[float]) -> int | None:
-    """Return the smallest number of prints for which the power reaches ``ENOUGH``, or None if no number that
-    was tried is enough. ``powers`` lists the powers for 1, 2, 3, … prints.
-    """
-    return next((prints for prints, power in enumerate(powers, start=1) if power >= ENOUGH), None)
-
-
-def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
+def surely_better(
+    question: Question, gain: float, difference: float, noise: float, prints: int, pixels: int
+) -> float:
     """Reduce a gain (difference of two squared errors) by an allowance for the error of the model itself.
-    Return the reduced gain in units of ``sd``. The result is 0 if the gain does not exceed the allowance.
+    Return the reduced gain in units of its standard deviation, which has two parts: the noise, and the
+    variation between prints, with the relative spread ``question.spread``. The result is 0 if the gain does
+    not exceed the allowance.
 
     Let A and B be the predictions of two refitted rivals after projection onto the complement of the per-scan
     terms, and D = B - A. Suppose that A is true except for noise n and an error e in the formulas of the
@@ -108,15 +100,18 @@ def surely_better(gain: float, difference: float, sd: float, form: float) -> flo
     counts as an error of the model. The larger of the two allowances is used.
 
     Args:
-        gain: |y - B|² - |y - A|², where A is the rival that fits better.
-        difference: |D|², the squared norm of the difference of the two predictions.
-        sd: standard deviation that noise causes in the gain.
-        form: |e|², the squared norm of the error in the formulas of the model; 0 if it is unknown. All four
-            arguments are computed over the same pixels and have the same unit.
+        question: the question among whose answers the rivals are. Its field ``form_nm`` is the largest
+            possible rms of e.
+        gain: |y - B|² - |y - A|², where A is the rival that fits better, summed over all pixels, nm².
+        difference: |D|², the squared norm of the difference of the two predictions, nm².
+        noise: variance of the gain that noise causes, nm⁴.
+        prints: number of prints.
+        pixels: number of pixels in all scans of these prints.
     """
+    sd = math.sqrt(noise + (question.spread * gain) ** 2 / prints)
     if sd <= 0:
         return 0.0
-    unknown = 2 * math.sqrt(difference * form)
+    unknown = 2 * math.sqrt(difference * pixels) * (question.form_nm or 0.0)
     # A gain that exceeds the expected gain |D|² raises no doubt about the form of the model, so it adds no
     # allowance.
     seen = difference - gain - Z_DECIDED * sd
@@ -127,14 +122,13 @@ _COUNTS = range(1, MOST_PRINTS + 1)
 # Number of times that the parameters of the rivals are drawn at random within their uncertainty. The power is
 # averaged over these draws, because the difference between two rivals may depend on the parameters.
 DRAWS = 8
-_HOPELESS: Status = "no experiment separates"
 
 
 def of_rivals(
     rivalry: Rivalry,
     tried: Mapping[str, float],
-    planned: Sequence[PlannedPrint],
-    random: Sequence[PlannedPrint],
+    planned: Sequence[Print],
+    random: Sequence[Print],
     prints: int,
 ) -> PlannedQuestion:
     """Plan how to answer a question whose rivals (competing explanations) are models. The power to decide the
@@ -167,13 +161,11 @@ def of_rivals(
             f"the model's own error is at most {question.form_nm:.1f} nm, and the two rivals differ by "
             f"{hardest.difference_nm:.1f} nm"
         )
-    if _status(hardest.power, prints) == _HOPELESS:
-        why.append(f"no experiment of this plan separates them, but another one might: {question.experiment}")
     return _planned(
         question,
         hardest.power,
         prints,
-        "; ".join(why),
+        why,
         [
             *(f"if {name} fits the scans better than every other rival, it is the cause" for name in names),
             "if two rivals fit equally well and better than the others, both remain possible, and the others "
@@ -189,27 +181,29 @@ def of_rivals(
     )
 
 
-def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
+def _pairs(rivalry: Rivalry, prints: Sequence[Print]) -> list[PlannedPair]:
     """Compare all pairs of rivals on the given prints. Either rival of a pair may be true. The power is
     computed for both cases, and the smaller power is returned. In each case, the power is averaged over
     random draws of the parameters of the rivals.
     """
-    random, first = np.random.default_rng(0), rivalry.linearised(prints)
+    random = np.random.default_rng(0)
+    first = [linearised(rivalry.twins, scan) for scans in prints for scan in scans]
     powers = []
     for _ in range(DRAWS):
         drawn = rivalry.drawn(random)
-        shown = drawn.contrasts(prints, drawn.refitted(prints, first=first))
+        shown = drawn.contrasts(prints, drawn.refitted(prints, first=first)).values()
         powers.append([[of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in shown])
     fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2, first=first))
-    directed = zip(np.mean(powers, axis=0).tolist(), fitted, strict=True)
-    ways = dict(zip(rivalry.pairs, directed, strict=True))
+    mean = dict(zip(fitted, np.mean(powers, axis=0).tolist(), strict=True))
     found = []
-    for pair in combinations(range(len(rivalry.twins)), 2):
-        mean, contrast = min((ways[pair], ways[pair[::-1]]), key=lambda one: one[0])
-        one, other = (rivalry.question.rivals[at].name for at in pair)
+    for pair in combinations(rivalry.twins, 2):
+        harder = min(pair, pair[::-1], key=mean.__getitem__)
         found.append(
             PlannedPair(
-                rivals=(one, other), difference_nm=contrast.rms_nm, noise_nm=contrast.noise_nm, power=mean
+                rivals=pair,
+                difference_nm=fitted[harder].rms_nm,
+                noise_nm=fitted[harder].noise_nm,
+                power=mean[harder],
             )
         )
     return found
@@ -234,7 +228,7 @@ def of_others(
             question,
             [of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS],
             prints,
-            "in a rotated scan, scan lines and written lines run along different axes of the layout",
+            ["in a rotated scan, scan lines and written lines run along different axes of the layout"],
             [
                 "if the line offsets follow the layout's rows even in rotated scans, the printer causes them",
                 "if the line offsets follow the scan lines, the microscope causes them",
@@ -245,7 +239,10 @@ def of_others(
             question,
             [of_repeats(n, scans) for n in _COUNTS],
             prints,
-            "every print is remounted and scanned again, and a term that the printer causes is then the same",
+            [
+                "every print is remounted and scanned again, and a term that the printer causes is then the "
+                "same"
+            ],
             [
                 "if scans of one print agree, the term comes from the printer and differs between prints",
                 "if scans of one print agree no better than scans of different prints, the term comes from "
@@ -253,25 +250,29 @@ def of_others(
             ],
         )
     told = [f"when the dataset card states the missing fact, the loop can test {question.name}"]
-    return _planned(question, [0.0 for _ in _COUNTS], prints, question.experiment, told)
+    return _planned(question, [0.0 for _ in _COUNTS], prints, [question.experiment], told)
 
 
 def _planned(
-    question: Question, powers: list[float], prints: int, why: str, outcomes: list[str], **known: Any
+    question: Question, powers: list[float], prints: int, why: list[str], outcomes: list[str], **known: Any
 ) -> PlannedQuestion:
+    status: Status = "may decide"
+    if question.kind == "fact":
+        status = "needs a fact"
+    elif powers[prints - 1] >= ENOUGH:
+        status = "decides"
+    elif powers[prints - 1] <= HOPELESS and max(powers) < ENOUGH:
+        status = "no experiment separates"
+        if question.rivals:
+            why.append(
+                f"no experiment of this plan separates them, but another one might: {question.experiment}"
+            )
     return PlannedQuestion(
         **question.model_dump(include={"name", "kind", "text", "form_nm"}),
-        status="needs a fact" if question.kind == "fact" else _status(powers, prints),
-        why=why,
+        status=status,
+        why="; ".join(why),
         power=powers,
-        prints_needed=prints_needed(powers),
+        prints_needed=next((n for n, power in zip(_COUNTS, powers, strict=True) if power >= ENOUGH), None),
         outcomes=outcomes,
         **{"random_power": powers, **known},
     )
-
-
-def _status(powers: Sequence[float], prints: int) -> Status:
-    if powers[prints - 1] >= ENOUGH:
-        return "decides"
-    hopeful = powers[prints - 1] > HOPELESS or max(powers) >= ENOUGH
-    return "may decide" if hopeful else _HOPELESS

@@ -9,8 +9,8 @@ to which the models were fitted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -22,16 +22,14 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.layouts.patterns import checkerboard, line_space_sweep
-from litho_data.layouts.random_layout import quantise, random_layout
+from litho_data.layouts.random_layout import random_layout
 from litho_data.register.coarse import SEARCH_BLUR_PX
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.topography import predicted_topography
-from litho_models.fitting.least_squares import Linearised
+from litho_models.effects import FieldContext
 from litho_models.planning.questions import OpenQuestions
-from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
+from litho_models.planning.rivalry import PLAIN, WAYS, Print, Rivalry, planned_scans
 
-TILE_PX = 256
-STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
 # The lowest levels that together cover less than this fraction of the area of earlier prints count as unknown
@@ -42,13 +40,6 @@ _RARE = 1e-3
 # penalty as long as the sum of these two differences, in levels, does not exceed this value.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
-TURNED = Way(turned_deg=90)
-WORDS = {
-    TURNED: "rotated by 90°",
-    Way(direction=-1): "in the other direction",
-    Way(tip=2): "with a new, sharp tip",
-    Way(pixel_size=0.5): "with half the pixel size and the same time per pixel",
-}
 _MOST_EXTRAS = 2
 # A further scan of each print is planned if it increases the separation of the rivals by at least this
 # factor.
@@ -111,19 +102,6 @@ class Limits:
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
 
-    def whole(self, soft: np.ndarray) -> np.ndarray:
-        """Round soft levels to whole level numbers, which the printer can print."""
-        span = self.highest - self.lowest
-        above = quantise((soft - self.lowest) / span, span + 1)
-        return above.astype(np.min_scalar_type(self.highest)) + self.lowest
-
-    def price(self, soft: Tensor) -> Tensor:
-        """Return a penalty. It is 0 if the mean and the standard deviation of the levels are close to their
-        values in earlier prints, and grows with the distance from these values.
-        """
-        far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
-        return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
-
     def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
         """Make a random layout with whole levels, of shape (size_px, size_px). ``finest`` is its cut-off
         frequency as a fraction of the highest allowed frequency.
@@ -139,15 +117,13 @@ class Limits:
         return np.maximum(level, self.lowest)
 
 
-def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the layouts from which an optimisation may start. Each layout is yielded as a pair: its name, and
-    its level numbers as an array of shape (size_px, size_px).
+def starts(size_px: int, limits: Limits, seed: int) -> dict[str, np.ndarray]:
+    """Return the layouts from which an optimisation may start, keyed by name. Each layout consists of level
+    numbers and has shape (size_px, size_px).
 
     A periodic pattern is surrounded by a frame with a random layout, because a scan of only a periodic
     pattern cannot be registered. The width of the frame is a fifth of the side length.
     """
-    for number, finest in enumerate((1.0, 0.5, 0.8)):
-        yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
     inset = size_px // 5
     shape = (size_px - 2 * inset,) * 2
@@ -157,135 +133,142 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
         "lines": sweep(),
         "lines-along-x": sweep(along="x"),
     }
+    found = {
+        f"random-{number + 1}": limits.random(size_px, seed + number, finest)
+        for number, finest in enumerate((1.0, 0.5, 0.8))
+    }
     for name, pattern in patterns.items():
-        whole = limits.random(size_px, seed + 7)
-        whole[inset:-inset, inset:-inset] = pattern
-        yield name, whole
+        found[name] = limits.random(size_px, seed + 7)
+        found[name][inset:-inset, inset:-inset] = pattern
+    return found
 
 
-def score(
-    rivalry: Rivalry,
-    level: np.ndarray,
-    ways: tuple[Way, ...],
-    place: Place = "centre",
-    doses: Sequence[float] = (1.0,),
-    known: dict[tuple[Way, Place, float], list[list[Linearised]]] | None = None,
-) -> float:
-    """Return the separation of the two most similar rivals, in standard deviations. It is computed for an
-    experiment in which the layout is printed once at each of the given doses. ``known`` is a cache of
-    linearised scans of this layout, which several experiments share.
-    """
-    known = {} if known is None else known
-    prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
-    scans = {(way, place, one.dose): replace(one, ways=(way,)) for one in prints for way in ways}
-    known |= {scan: rivalry.linearised([one]) for scan, one in scans.items() if scan not in known}
-    first = [
-        [known[way, place, dose][at][0] for dose in doses for way in ways] for at in range(len(rivalry.twins))
-    ]
-    return float(rivalry.separations(prints, rivalry.refitted(prints, first=first)).min())
+def score(rivalry: Rivalry, prints: Sequence[Print]) -> float:
+    """Return the separation of the two most similar rivals on planned prints, in standard deviations."""
+    return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
 
 
 def climb(
     rivalry: Rivalry,
     start: np.ndarray,
-    ways: tuple[Way, ...],
+    scans_of: Callable[[Tensor], Print],
     limits: Limits,
-    *,
-    place: Place = "centre",
-    steps: int = STEPS,
+    steps: int,
 ) -> np.ndarray:
     """Increase the separation of the rivals by gradient ascent from the layout ``start``. Return the best
-    soft (not rounded) levels, of shape (ny, nx).
+    soft (not rounded) levels, of shape (ny, nx). The function ``scans_of`` plans the scans of a layout.
     """
-    free = as_tensor(start).requires_grad_()
+    free = torch.tensor(start, dtype=torch.float32, requires_grad=True)
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
     for step in range(steps + 1):
         soft = limits.soft(free)
         fresh = step % _REFIT_EVERY == 0 or step == steps
         if fresh:
-            refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
-        apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
+            refitted = rivalry.refitted([scans_of(soft.detach())])
+        apart = rivalry.separations([scans_of(soft)], refitted)
         # The separation is exact only in steps in which the rivals have been refitted to the current layout,
         # so only these steps may give the best layout.
         if fresh and apart.min().item() > highest:
             best, highest = soft.detach().numpy().copy(), apart.min().item()
         # The negative log-sum-exp is a soft minimum over the pairs of rivals. With a hard minimum, the ascent
         # would alternate between pairs.
+        far = (soft.mean() - limits.mean).abs() + (soft.std() - limits.sd).abs()
+        penalty = _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
         climber.zero_grad()
-        (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
+        (penalty + torch.logsumexp(-apart, 0)).backward()
         climber.step()
     return best
 
 
 def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
-    """Assemble the tiles of a print into a layout with whole level numbers. The order of the tiles depends on
-    ``number``, the number of the print, so it differs between prints. The result has shape (size_px,
-    size_px).
+    """Assemble the tiles of a print into a layout with whole level numbers, which the printer can print. The
+    order of the tiles depends on ``number``, the number of the print, so it differs between prints. The
+    result has shape (size_px, size_px).
     """
-    side = -(-size_px // tiles[0].shape[0])
-    order = [tiles[(place + number) % len(tiles)] for place in range(side**2)]
-    whole = np.block([order[row * side : (row + 1) * side] for row in range(side)])[:size_px, :size_px]
-    return limits.whole(limits.soft(as_tensor(whole)).numpy())
-
-
-def as_tensor(level: np.ndarray) -> Tensor:
-    """Convert the levels of a planned print to a float32 tensor."""
-    return torch.from_numpy(level.astype(np.float32))
+    side = -(-size_px // len(tiles[0]))
+    order = (np.arange(side**2).reshape(side, side) + number) % len(tiles)
+    whole = np.block([[tiles[at] for at in row] for row in order])[:size_px, :size_px]
+    soft = limits.soft(torch.tensor(whole, dtype=torch.float32))
+    return soft.round().numpy().astype(np.min_scalar_type(limits.highest))
 
 
 class Chosen(NamedTuple):
     """The choice of how to make and scan prints, for one question or for all questions.
 
-    ``ways`` lists the ways in which each print is scanned, one per scan. Successive prints cycle through
-    ``places``, the positions in the write field, and through ``doses``, the relative doses. ``tried``
+    ``ways`` lists the ways in which each print is scanned, one per scan, as keys of ``WAYS``. ``at_edge``
+    states whether every other print, starting with the first, lies at the edge of the write field.
+    ``weaker`` states whether every other print, starting with the second, has a smaller dose. ``tried``
     contains the separation of the two most similar rivals, in standard deviations, in each experiment that
     was tried, keyed by a description of the experiment.
     """
 
-    ways: tuple[Way, ...]
-    places: tuple[Place, ...]
-    doses: tuple[float, ...]
+    ways: tuple[str, ...]
+    at_edge: bool
+    weaker: bool
     tried: dict[str, float]
 
+    def prints(self, levels: Sequence[np.ndarray], plain: FieldContext, count: int) -> list[Print]:
+        """Plan the scans of the first prints of a series of ``count`` prints, given the levels of each of
+        their layouts. ``plain`` is as for ``planned_scans``.
+        """
+        return [
+            planned_scans(
+                plain,
+                level,
+                self.ways,
+                at_edge=self.at_edge and number % 2 == 0,
+                order=number / max(count - 1, 1) - 0.5,
+                dose=SECOND_DOSE if self.weaker and number % 2 else 1.0,
+            )
+            for number, level in enumerate(levels)
+        ]
 
-def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
+
+def choose(rivalry: Rivalry, level: np.ndarray, plain: FieldContext) -> Chosen:
     """Choose the ways to print and scan that best separate the rivals of a question.
 
     Args:
+        rivalry: the rivals.
         level: layout on which the ways are tried, as level numbers of shape (ny, nx).
-        can_move: whether the write field is larger than a print.
+        plain: as for ``planned_scans``. Its layout has the size of a print.
     """
-    separation = partial(score, rivalry, level, known={})
-    ways: tuple[Way, ...] = (Way(),)
+
+    def separation(ways: Sequence[str], at_edge: bool = False, doses: Sequence[float] = (1.0,)) -> float:
+        return score(
+            rivalry, [planned_scans(plain, level, ways, at_edge=at_edge, dose=dose) for dose in doses]
+        )
+
+    ways: tuple[str, ...] = (PLAIN,)
     reached = separation(ways)
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
-        scores = {way: separation((*ways, way)) for way in WORDS if way not in ways}
+        scores = {way: separation((*ways, way)) for way in WAYS if way not in ways}
         # The report states the separation for the plain scan together with a single other scan. These values
         # are computed in the first round, so later rounds do not overwrite them.
-        tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
-        best = max(scores, key=lambda way: scores[way])
+        for way, own in scores.items():
+            tried.setdefault(f"a scan {way}", own)
+        best = max(scores, key=scores.__getitem__)
         if not _worth(scores[best], reached):
             break
         ways, reached = (*ways, best), scores[best]
-    places: tuple[Place, ...] = ("centre",)
-    if can_move:
-        tried["at the edge of the write field"] = at_edge = separation(ways, "edge")
-        places = ("edge", "centre") if _worth(at_edge, reached) else places
-    one, two = (separation(ways, places[0], (1.0, dose)) for dose in (1.0, SECOND_DOSE))
+    at_edge = plain.radius_um() > max(plain.layout_um.shape) * plain.pitch_um / 2
+    if at_edge:
+        tried["at the edge of the write field"] = there = separation(ways, at_edge)
+        at_edge = _worth(there, reached)
+    one, two = (separation(ways, at_edge, (1.0, dose)) for dose in (1.0, SECOND_DOSE))
     both = "two prints with these scans"
     tried |= {both: one, f"{both}, the second at {SECOND_DOSE:g} of the dose": two}
-    return Chosen(ways, places, (1.0, SECOND_DOSE) if _worth(two, one) else (1.0,), tried)
+    return Chosen(ways, at_edge, _worth(two, one), tried)
 
 
-def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
+def together(choices: Collection[Chosen], asked: Sequence[str]) -> Chosen:
     """Combine the choices that were made for each question into one choice for all questions. ``asked``
     contains the ways to scan that are needed for questions whose answer does not depend on a layout.
     """
-    ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
-    places = max((one.places for one in choices), key=len, default=("centre",))
-    return Chosen(tuple(ways), places, max((one.doses for one in choices), key=len, default=(1.0,)), {})
+    ways = dict.fromkeys([PLAIN, *asked, *(way for one in choices for way in one.ways)])
+    at_edge, weaker = any(one.at_edge for one in choices), any(one.weaker for one in choices)
+    return Chosen(tuple(ways), at_edge, weaker, {})
 
 
 def _worth(more: float, reached: float) -> bool:
@@ -295,11 +278,11 @@ def _worth(more: float, reached: float) -> bool:
 def climbed(
     rivalries: Sequence[Rivalry],
     chosen: Chosen,
+    begun: Mapping[str, np.ndarray],
     limits: Limits,
-    tile_px: int,
+    plain: FieldContext,
     count: int,
     *,
-    seed: int,
     steps: int,
     kept: Path,
     report: Callable[[str], None],
@@ -310,10 +293,10 @@ def climbed(
     Args:
         rivalries: the rivals of each question.
         chosen: the ways to print and scan.
+        begun: layouts from which the optimisation may start, as returned by ``starts``.
         limits: limits for the layouts.
-        tile_px: side length of a tile in pixels.
+        plain: as for ``planned_scans``.
         count: number of tiles.
-        seed: seed of the random layouts from which the optimisation starts.
         steps: number of ascent steps for each tile.
         kept: folder in which finished tiles are saved. Tiles that an interrupted run has saved there are
             reused.
@@ -321,18 +304,18 @@ def climbed(
     """
     kept.mkdir(parents=True, exist_ok=True)
     report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
-    able = [one for one in starts(tile_px, limits, seed) if _repeats(one[1]) <= _MOST_REPEATING]
-    ranked = [sorted(able, key=lambda one: -score(rivalry, one[1], chosen.ways)) for rivalry in rivalries]
+    scans_of = partial(planned_scans, plain, ways=chosen.ways)
+    able = [one for one in begun.items() if _repeats(one[1]) <= _MOST_REPEATING]
+    ranked = [sorted(able, key=lambda one: -score(rivalry, [scans_of(one[1])])) for rivalry in rivalries]
     tiles = []
     for number in range(count):
         rank, which = divmod(number, len(rivalries))
-        name, start = ranked[which][rank % len(ranked[which])]
+        rivalry, (name, start) = rivalries[which], ranked[which][rank % len(able)]
         file = kept / f"{number}.npy"
         if not file.is_file():
-            rivalry = rivalries[which]
             asked = rivalry.question.name
             report(f"optimising tile {number + 1} of {count} for {asked}, starting from {name}")
-            tile = climb(rivalry, start, chosen.ways, limits, place=chosen.places[0], steps=steps)
+            tile = climb(rivalry, start, partial(scans_of, at_edge=chosen.at_edge), limits, steps)
             with atomic_file(file) as temporary:
                 np.save(temporary, tile)
         tiles.append(np.load(file))

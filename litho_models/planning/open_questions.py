@@ -14,6 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
+from scipy.stats import median_abs_deviation
 
 from litho_data.layouts.statistics import layout_statistics
 from litho_data.store import PrintedScan
@@ -63,9 +65,11 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
         single_scans: findings of this loop about per-scan terms.
     """
     asking = _Asking(closed)
-    found = [asking.of_cause(one) for one in closed.traced]
     stored = closed.study.stored
     write = stored[0].write or {}
+    # Effects that could not be tested because a fact about the prints is missing, each with the reason.
+    unplaced = "the position of the prints in the write field is not known"
+    missing = dict.fromkeys(() if "field_um" in write else _OF_PLACE, unplaced) | closed.untestable
     return OpenQuestions(
         dataset=dataset,
         noise=asking.noise,
@@ -76,9 +80,19 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
         surround=write.get("surround"),
         instrument=stored[0].seen_by,
         questions=[
-            *(one for one in (*found, asking.of_suspects()) if one is not None),
-            *_of_single_scans(single_scans),
-            *(_question("fact", [one], text=why) for one, why in _missing_facts(closed).items()),
+            *filter(None, (*map(asking.of_cause, closed.traced), asking.of_suspects())),
+            *(
+                _question(
+                    "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
+                    [one.name],
+                    sizes={parameter: spread.value for parameter, spread in one.spread.items()},
+                )
+                for one in single_scans
+                if one.seen
+                and terms_of_effect(one.name)
+                and (one.role == "undetermined" or one.confusable_with)
+            ),
+            *(_question("fact", [one], text=why) for one, why in missing.items()),
         ],
     )
 
@@ -118,11 +132,11 @@ class _Asking:
         # If another effect replaces the cause, its fit starts from the values that screening found before any
         # cause was added to the model.
         first = {**self.closed.lawful.first, **self.closed.named.first}
-        twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
+        twins = {cause.name: self.twin} | {one: _with(without, first[one]) for one in members[1:]}
         return _question(
             "set" if cause.alike else "role",
             members,
-            rivals=self._rivals(members, twins),
+            rivals=self._rivals(twins),
             spread=self._spread(cause.name),
             form_nm=[*self.closed.rests.values()][-1].most_nm,
         )
@@ -135,16 +149,16 @@ class _Asking:
         """
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
-        standing = [
+        unconfirmed = (
             one
             for name, one in named.last.items()
             if name in named.refused and name not in self.twin.names and one.allowed and one.gain_nm2 >= least
-        ]
-        standing = sorted(standing, key=lambda one: -one.gain_nm2)[:_MOST_MEMBERS]
+        )
+        standing = sorted(unconfirmed, key=lambda one: -one.gain_nm2)[:_MOST_MEMBERS]
         names = [one.name for one in standing]
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
-        rivals = self._rivals(names, [_with(self.twin, one) for one in standing])
+        rivals = self._rivals({one.name: _with(self.twin, one) for one in standing})
         # The loop has estimated the error in the form of the model only for the model without these effects.
         # Here, this error is estimated for every model with one of the effects, and the smallest estimate is
         # used.
@@ -153,13 +167,13 @@ class _Asking:
         form_nm = min(learner.rest(one).most_nm for one in maps)
         return _question("suspects", names, rivals=rivals, form_nm=form_nm)
 
-    def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> list[Rival]:
-        self.study.report(f"fitting the rivals {', '.join(members)}")
+    def _rivals(self, twins: Mapping[str, Twin]) -> list[Rival]:
+        self.study.report(f"fitting the rivals {', '.join(twins)}")
         windows, units = self.study.windows, independent(self.study.scans)
         stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
         rivals = []
-        for member, twin, fit in zip(members, twins, fit_rivals(twins, windows), strict=True):
-            fitted = twin.at(fit.vector)
+        for member, fit in fit_rivals(twins, windows).items():
+            fitted = twins[member].at(fit.vector)
             free = fitted.free()[:, None]
             linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
             information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
@@ -195,10 +209,10 @@ class _Asking:
             size = float((change**2).sum())
             if size:
                 multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
-                own.append(self.noise.along(change) ** 2 / size)
+                own.append(float(self.noise.variance(torch.from_numpy(change))) / size**2)
         # The spread is estimated robustly (from the median absolute deviation), because a scan may have a
         # defect.
-        spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
+        spread = median_abs_deviation(multiples, scale=0.6745)
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
 
 
@@ -218,21 +232,6 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
 
 
-def _of_single_scans(single_scans: Sequence[ScanFinding]) -> list[Question]:
-    """Return the questions about line offsets and per-scan terms for which it is unknown whether the printer
-    or the microscope causes them.
-    """
-    return [
-        _question(
-            "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
-            [one.name],
-            sizes={parameter: spread.value for parameter, spread in one.spread.items()},
-        )
-        for one in single_scans
-        if one.seen and terms_of_effect(one.name) and (one.role == "undetermined" or one.confusable_with)
-    ]
-
-
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
     """Make a question about the named effects, with its text. The argument ``text`` is used only for the kind
     ``fact``. It states which fact is missing, and the question is about a single effect.
@@ -248,12 +247,3 @@ def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) ->
         text = f"{first}: caused by the printer or by the microscope"
     name = " or ".join(names) if kind == "suspects" else names[0]
     return Question(name=name, kind=kind, text=text, experiment=separating(names), **known)
-
-
-def _missing_facts(closed: Closed) -> dict[str, str]:
-    """Return the effects that could not be tested because a fact about the prints is missing, each with the
-    reason.
-    """
-    known = "field_um" in (closed.study.scans[0].stored.write or {})
-    unplaced = "the position of the prints in the write field is not known"
-    return dict.fromkeys(() if known else _OF_PLACE, unplaced) | closed.untestable

@@ -10,17 +10,20 @@ differ by several nm² (mean square) for this reason alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
+import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import Field
 from scipy.ndimage import map_coordinates
+from torch import Tensor
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.roughness.spectrum import hann
 from litho_data.store.schema import DatasetId, Instrument, Surround
 from litho_models.effects.chain import Frame
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
@@ -51,14 +54,13 @@ class NoiseSpectrum(Record):
         at = np.meshgrid(*[np.fft.fftfreq(n) * len(power) for n in shape], indexing="ij")
         return map_coordinates(power, at, order=1, mode="grid-wrap")
 
-    def along(self, change: np.ndarray) -> float:
-        """Return the standard deviation, nm, of the noise after projection onto a given change of the height,
-        which is a map of shape (ny, nx).
-
-        The projection is the sum over pixels of noise times change, divided by the norm of the change.
+    def variance(self, change: Tensor) -> Tensor:
+        """Return the variance, nm⁴, that the noise causes in the sum over pixels of noise times change.
+        ``change`` is a change of the height, nm, of shape (…, ny, nx). The result has shape (…) and is
+        differentiable.
         """
-        spectrum = np.abs(np.fft.fft2(change)) ** 2
-        return float(np.sqrt((spectrum * self.on_grid(change.shape)).sum() / spectrum.sum()))
+        power = torch.from_numpy(self.on_grid(change.shape[-2:])).to(change)
+        return (torch.fft.fft2(change).abs() ** 2 * power).sum((-2, -1)) / power.numel()
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
@@ -81,18 +83,16 @@ def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
     is returned.
     """
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
-    window = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
+    window = hann((size, size))
     window /= np.sqrt((window**2).mean())
     powers: list[np.ndarray] = []
     for residual in residuals_nm:
-        every = sliding_window_view(residual, (size, size))[:: size // 2, :: size // 2].reshape(
-            -1, size, size
-        )
-        tiles = every[np.isfinite(every).all(axis=(1, 2))]
+        every = sliding_window_view(residual, (size, size))[:: size // 2, :: size // 2]
+        tiles = every[np.isfinite(every).all(axis=(2, 3))]
         about_mean = tiles - tiles.mean(axis=(1, 2), keepdims=True)
         powers += [*np.abs(np.fft.fft2(about_mean * window)) ** 2 / size**2]
     if not powers:
-        powers = [np.full((size, size), float(np.mean([np.nanvar(one) for one in residuals_nm])))]
+        powers = [np.full((size, size), np.mean([*map(np.nanvar, residuals_nm)]))]
     return NoiseSpectrum(power_nm2=np.mean(powers, axis=0).round(3).tolist())
 
 
@@ -197,10 +197,11 @@ class OpenQuestions(Result):
     questions: list[Question]
 
 
-def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
+def fit_rivals(twins: Mapping[str, Twin], windows: Sequence[PreparedScan]) -> dict[str, LeastSquaresFit]:
     """Fit each model twice. The first fit starts from the current parameter values of the model. In the
     second fit, the base parameters start from those of the model that fitted best, and the other parameters
-    start from the result of the first fit. For each model, keep the better of the two fits.
+    start from the result of the first fit. For each model, keep the better of the two fits. Models and fits
+    are keyed by the name of the answer.
     """
 
     def fitted(twin: Twin) -> LeastSquaresFit:
@@ -209,12 +210,11 @@ def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[L
     def squares(fit: LeastSquaresFit) -> float:
         return eliminated_sum(fit.linear, RULES.term_weight)[2]
 
-    fits = [fitted(twin) for twin in twins]
-    best = min(fits, key=squares)
-    base = best.vector[: twins[0].own]
-    return [
-        fit
-        if fit is best or not len(base)
-        else min(fit, fitted(twin.at(np.concatenate([base, fit.vector[len(base) :]]))), key=squares)
-        for twin, fit in zip(twins, fits, strict=True)
-    ]
+    fits = {name: fitted(twin) for name, twin in twins.items()}
+    best = min(fits.values(), key=squares)
+    for name, fit in fits.items():
+        own = twins[name].own
+        if own and fit is not best:
+            start = np.concatenate([best.vector[:own], fit.vector[own:]])
+            fits[name] = min(fit, fitted(twins[name].at(start)), key=squares)
+    return fits

@@ -4,7 +4,7 @@ rivals (competing explanations), and the power to decide between them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +14,10 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.reports.page import Page, capitalised
 from litho_data.reports.pictures import new_figure
+from litho_models.effects import FieldContext
 from litho_models.planning.answers import ENOUGH
 from litho_models.planning.record import NextPrint
-from litho_models.planning.rivalry import PlannedPrint, Rivalry
+from litho_models.planning.rivalry import Rivalry, predict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,9 +37,21 @@ _COLUMNS = (
 
 
 def write_report(
-    folder: Path, plan: NextPrint, rivalries: Sequence[Rivalry], planned: Sequence[PlannedPrint]
+    folder: Path,
+    plan: NextPrint,
+    levels: Sequence[np.ndarray],
+    rivalries: Mapping[str, Rivalry],
+    shown: FieldContext,
 ) -> Path:
-    """Write ``report.html`` and its tables ``questions.csv`` and ``order.csv``."""
+    """Write ``report.html`` and its tables ``questions.csv`` and ``order.csv``.
+
+    Args:
+        folder: folder of the plan.
+        plan: the record.
+        levels: the layout of each print.
+        rivalries: the rivals of each question, keyed by the name of the question.
+        shown: the last scan of the first print.
+    """
     page = Page(
         f"What to print next: {plan.dataset.name}",
         f"{plan.prints} print{'s' * (plan.prints > 1)} with a side of {plan.field_um:g} µm, and "
@@ -48,7 +61,7 @@ def write_report(
         words=Path(__file__).with_name("words.toml"),
     )
     page.verdict(_verdict(plan))
-    first = {f"print {at}": one.level.numpy() for at, one in enumerate(planned[:_SHOWN_LAYOUTS], start=1)}
+    first = {f"print {at}": level for at, level in enumerate(levels[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
         layouts_figure(first, plan.levels),
         "Levels of the first prints. All prints consist of the same tiles, in a different order in each "
@@ -65,14 +78,13 @@ def write_report(
         "questions.csv",
         columns=_COLUMNS,
     )
-    pictured = {rivalry.question.name: rivalry for rivalry in rivalries}
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)
         page.paragraph(" ".join(f"{capitalised(text)}." for text in (question.text, question.why)))
         page.points([f"{capitalised(outcome)}." for outcome in question.outcomes])
-        if question.name in pictured:
+        if question.rivals:
             page.figure(
-                prints_figure(pictured[question.name], planned[0]),
+                prints_figure(rivalries[question.name], shown),
                 "Height that each rival predicts for the last scan of the first print (top row), and the "
                 "difference of this prediction from that of the first rival (bottom row).",
             )
@@ -94,22 +106,24 @@ def _verdict(plan: NextPrint) -> str:
     )
 
 
-def prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
-    """Draw the height that each rival (competing explanation) predicts for the last scan of a print. Also
-    draw the differences of these predictions from the prediction of the first rival.
+def prints_figure(rivalry: Rivalry, shown: FieldContext) -> Figure:
+    """Draw the height that each rival (competing explanation) predicts for a scan. Also draw the differences
+    of these predictions from the prediction of the first rival.
     """
-    maps = [rivalry.printing.predict(chain, shown, shown.ways[-1]).numpy() for chain in rivalry.chains]
-    figure = new_figure(11, 5.5)
+    maps = [predict(twin, shown).numpy() for twin in rivalry.twins.values()]
     changes = [NM_PER_UM * (own - maps[0] - (own - maps[0]).mean()) for own in maps]
     reach = np.percentile(np.abs(changes[1:]), 99)
-    lowest, highest = np.min(maps), np.max(maps)
+    rows = (
+        (maps, "viridis", np.min(maps), np.max(maps), "height, µm"),
+        (changes, "RdBu_r", -reach, reach, "difference, nm"),
+    )
+    figure = new_figure(11, 5.5)
     axes = figure.subplots(2, len(maps), squeeze=False)
-    for column, (rival, own, change) in enumerate(zip(rivalry.question.rivals, maps, changes, strict=True)):
-        height = axes[0, column].imshow(own, cmap="viridis", vmin=lowest, vmax=highest)
-        axes[0, column].set_title(rival.name, fontsize=9)
-        picture = axes[1, column].imshow(change, cmap="RdBu_r", vmin=-reach, vmax=reach)
-    for one in axes.flat:
-        one.set_axis_off()
-    figure.colorbar(height, ax=axes[0], label="height, µm", shrink=0.7)
-    figure.colorbar(picture, ax=axes[1], label="difference, nm", shrink=0.7)
+    for row, (images, colours, low, high, label) in zip(axes, rows, strict=True):
+        for one, image in zip(row, images, strict=True):
+            picture = one.imshow(image, cmap=colours, vmin=low, vmax=high)
+            one.set_axis_off()
+        figure.colorbar(picture, ax=row, label=label, shrink=0.7)
+    for one, name in zip(axes[0], rivalry.twins, strict=True):
+        one.set_title(name, fontsize=9)
     return figure

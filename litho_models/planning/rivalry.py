@@ -13,10 +13,10 @@ earlier prints and within the ranges of its parameters.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import FieldContext
-from litho_models.effects.chain import EffectChain, Fields
+from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import Linearised, eliminated_sum, orthonormal, solve_damped
 from litho_models.loop.fits import RULES
 from litho_models.loop.model import Twin
@@ -33,136 +33,106 @@ from litho_models.planning.questions import NoiseSpectrum, Question
 from litho_models.scan_terms import TermPixels, term_maps
 from litho_models.simulator import Simulator
 
-Place = Literal["centre", "edge"]
+# The scans of a planned print. All scans of all planned prints have the same shape.
+Print = Sequence[FieldContext]
+# The names of two rivals. The first is assumed to be true, and the second is refitted to its prediction.
+Pair = tuple[str, str]
 _DAMPING = 1e-6
 _SMALLEST = 1e-12
+PLAIN, TURNED = "like the earlier prints", "rotated by 90°"
+# Ways to scan a print, in words. For each of them, the facts about the scan that differ from earlier scans.
+WAYS: dict[str, dict[str, Any]] = {
+    PLAIN: {},
+    TURNED: {"quarter_turns": 1},
+    "in the other direction": {"backward": True},
+    "with a new, sharp tip": {"new_tip": True},
+    "with half the pixel size and the same time per pixel": {"pixel_size": 0.5},
+}
 
 
-@dataclass(frozen=True)
-class Way:
-    """The way in which one scan is made. The fields of this class are also columns in the table of planned
-    scans.
+def planned_scans(
+    plain: FieldContext,
+    level: np.ndarray | Tensor,
+    ways: Iterable[str],
+    *,
+    at_edge: bool = False,
+    order: float = 0.0,
+    dose: float = 1.0,
+) -> list[FieldContext]:
+    """Plan a print and its scans. Return the facts about each scan that models need.
 
-    ``turned_deg`` is the angle by which the print is rotated under the microscope. ``direction`` is 1 for the
-    trace and -1 for the retrace. ``tip`` is 1 for the tip of earlier scans and 2 for a new, sharp tip.
-    ``pixel_size`` is the size of a pixel relative to the pixel size of earlier scans; the time per pixel
-    stays the same.
+    Args:
+        plain: facts that all planned prints share, such as the pitch and the width of the write field.
+        level: levels of the layout, of shape (ny, nx). They need not be whole numbers. The scans are
+            differentiable with respect to them if they are a tensor.
+        ways: the ways in which the print is scanned, one per scan, as keys of ``WAYS``.
+        at_edge: whether the print lies in a corner of the write field instead of its centre.
+        order: position in the writing order, from -0.5 (first) to 0.5 (last).
+        dose: dose relative to earlier prints.
     """
+    reach_um = plain.radius_um() - max(level.shape) * plain.pitch_um / 2 if at_edge else 0.0
+    printed = replace(
+        plain,
+        layout_um=(dose * plain.slice_um * torch.as_tensor(level, dtype=torch.float32))[None, None],
+        field_centre_um=(reach_um, reach_um),
+        order=order,
+        dose=dose,
+    )
+    return [replace(printed, **WAYS[way]) for way in ways]
 
-    turned_deg: int = 0
-    direction: int = 1
-    tip: int = 1
-    pixel_size: float = 1.0
 
-
-@dataclass(frozen=True)
-class PlannedPrint:
-    """One planned print (a printed field) and its scans.
-
-    ``level`` contains the levels of the layout and has shape (ny, nx). The levels need not be whole
-    numbers.
-    ``ways`` lists the ways in which the print is scanned, one per scan. ``place`` is the position in the
-    write field. ``order`` is the position in the writing order, from -0.5 (first) to 0.5 (last). ``dose`` is
-    relative to earlier prints.
+def predict(twin: Twin, scan: FieldContext, known: Fields | None = None) -> Tensor:
+    """Predict the height that a planned scan would show, µm, of shape (ny, nx). The prediction is
+    differentiable with respect to the layout. ``known`` is a cache of intermediate fields of this scan, which
+    several models can share.
     """
-
-    level: Tensor
-    ways: tuple[Way, ...]
-    place: Place = "centre"
-    order: float = 0.0
-    dose: float = 1.0
+    chain = twin.chain().requires_grad_(False)
+    return chain(scan.layout_um, scan, known, twin.numbers.tobytes())[0, 0]
 
 
-@dataclass(frozen=True)
-class Printing:
-    """The settings that all planned prints share: the lateral pitch, the height of a level, the highest
-    level, the width of the write field (None if it is unknown), and the axis perpendicular to the written
-    lines. Lengths are in µm.
+def linearised(twins: Mapping[str, Twin], scan: FieldContext) -> dict[str, Linearised]:
+    """Linearise the prediction of each model for a planned scan at the parameters of the model. The residual
+    in each result is the negative of the predicted height. The caller must add the heights to which the model
+    is fitted.
     """
-
-    pitch_um: float
-    level_height_um: float
-    highest: int
-    write_field_um: float | None = None
-    slow_axis: Literal["y", "x"] = "y"
-
-    def reach_um(self, printed: PlannedPrint) -> float:
-        """Return the coordinate of the centre of a print relative to the centre of the write field, µm. It is
-        the same along x and y, because a print whose place is the edge lies in a corner of the write field.
-        It is 0 for a print at the centre, or if the width of the write field is unknown.
-        """
-        if printed.place == "centre" or self.write_field_um is None:
-            return 0.0
-        return (self.write_field_um - max(printed.level.shape) * self.pitch_um) / 2
-
-    def context(self, layout_um: Tensor, printed: PlannedPrint, way: Way) -> FieldContext:
-        """Return the facts about a planned scan that effects need, such as its orientation and its dose."""
-        reach_um = self.reach_um(printed)
-        return FieldContext(
-            layout_um,
-            self.pitch_um,
-            self.highest * self.level_height_um,
-            self.level_height_um,
-            (reach_um, reach_um),
-            None if self.write_field_um is None else self.write_field_um / 2,
-            self.slow_axis,
-            order=printed.order,
-            quarter_turns=way.turned_deg // 90,
-            backward=way.direction < 0,
-            new_tip=way.tip > 1,
-            pixel_size=way.pixel_size,
-            dose=printed.dose,
-        )
-
-    def predict(
-        self,
-        chain: EffectChain,
-        printed: PlannedPrint,
-        way: Way,
-        known: Fields | None = None,
-        base_key: object = None,
-    ) -> Tensor:
-        """Predict the height that a planned scan would show, µm, of shape (ny, nx). ``known`` and
-        ``base_key`` are passed to ``EffectChain.forward``.
-        """
-        layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
-        return chain(layout_um, self.context(layout_um, printed, way), known, base_key)[0, 0]
+    # Models with the same base share its predictions.
+    known: Fields = {}
+    found = {}
+    for name, twin in twins.items():
+        steps = twin.steps()
+        moved = (twin.at(twin.vector + one) for one in np.diag(steps))
+        heights = _inner(torch.stack([predict(one, scan, known) for one in (twin, *moved)]))
+        rows = _rows(heights)
+        derivatives = (rows[1:] - rows[0]) / steps[:, None]
+        found[name] = Linearised(-rows[0], derivatives, _free_basis(heights[0]).T)
+    return found
 
 
 @dataclass(frozen=True)
 class Contrast:
     """The difference between the predictions of two rivals on some prints. One rival is assumed to be true,
-    and the other is refitted to its prediction. Each attribute has shape (prints,), with one value for each
-    print.
+    and the other is refitted to its prediction.
 
-    ``squares_um2`` is the squared distance between the two predictions, summed over all pixels and scans of a
-    print. ``sd_um2`` is the standard deviation that noise causes in the difference of the squared errors of
-    the two rivals. ``pixels`` is the number of pixels in all scans of a print.
+    ``squares_nm2`` is the squared distance between the two predictions, summed over all pixels and scans of a
+    print. ``sd_nm2`` is the standard deviation that noise causes in the difference of the squared errors of
+    the two rivals. Both have shape (prints,). ``pixels`` is the number of pixels in all scans of a print.
     """
 
-    squares_um2: Tensor
-    sd_um2: Tensor
-    pixels: Tensor
+    squares_nm2: Tensor
+    sd_nm2: Tensor
+    pixels: int
 
     @property
     def rms_nm(self) -> float:
         """Return the rms difference between the two predictions over all pixels, nm."""
-        return NM_PER_UM * float((self.squares_um2.sum() / self.pixels.sum()).sqrt())
+        return float((self.squares_nm2.mean() / self.pixels).sqrt())
 
     @property
     def noise_nm(self) -> float:
         """Return the standard deviation per pixel of the noise after projection onto the difference of the
         predictions, nm.
         """
-        return NM_PER_UM * float((self.sd_um2 / (2 * self.squares_um2.sqrt() + _SMALLEST)).mean())
-
-    def separation(self, spread: float) -> Tensor:
-        """Return the squared distance between the two predictions in units of its standard deviation. The
-        result is differentiable. ``spread`` is the relative standard deviation, over prints, of the squared
-        distance (the field ``spread`` of the question).
-        """
-        variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
-        return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
+        return float((self.sd_nm2 / (2 * self.squares_nm2.sqrt() + _SMALLEST)).mean())
 
 
 class Rivalry:
@@ -171,25 +141,17 @@ class Rivalry:
     Args:
         question: a question with at least two rivals.
         base: the base model of all rivals. Its parameters come first in the field ``vector`` of a rival.
-        printing: settings that all planned prints share.
         noise: spectrum of the noise, measured on the residuals of earlier prints.
+
+    Attributes:
+        twins: the model of each rival, keyed by the name of the rival. Refits start from these models.
+        true: models of the rivals, each of which is in turn assumed to be the true one.
     """
 
-    def __init__(self, question: Question, base: Simulator, printing: Printing, noise: NoiseSpectrum):
+    def __init__(self, question: Question, base: Simulator, noise: NoiseSpectrum):
         self.question = question
-        self.printing = printing
         self.noise = noise
-        self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
-        # Each of the models in ``true`` is in turn assumed to be the true one. Refits of a model start from
-        # its entry in ``twins``.
-        self.true = self.chains = [*map(_chain, self.twins)]
-
-    @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Return all ordered pairs of rivals. The first index of a pair is the model that is assumed to be
-        true, and the second is the model that is refitted to its prediction.
-        """
-        return list(permutations(range(len(self.twins)), 2))
+        self.true = self.twins = {rival.name: rival.twin(Twin.bare(base)) for rival in question.rivals}
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
         """Return a copy in which the models that are assumed to be true have random parameters. The
@@ -197,144 +159,113 @@ class Rivalry:
         prints.
         """
         other = copy.copy(self)
-        other.true = []
-        for twin, rival in zip(self.twins, self.question.rivals, strict=True):
-            moved = random.multivariate_normal(np.zeros(len(twin.vector)), np.array(rival.covariance))
-            other.true.append(_chain(twin.at(twin.vector + np.clip(moved, *twin.room()))))
+        other.true = {}
+        for rival in self.question.rivals:
+            twin = self.twins[rival.name]
+            moved = random.multivariate_normal(0 * twin.vector, rival.covariance)
+            other.true[rival.name] = twin.at(twin.vector + np.clip(moved, *twin.room()))
         return other
 
     def refitted(
         self,
-        prints: Sequence[PlannedPrint],
+        prints: Sequence[Print],
         *,
         rounds: int = 1,
-        first: Sequence[list[Linearised]] | None = None,
-    ) -> list[EffectChain]:
+        first: Sequence[Mapping[str, Linearised]] | None = None,
+    ) -> dict[Pair, Twin]:
         """For each ordered pair of rivals, refit the second model to the prediction of the first model.
-        Return the refitted models, one per pair, in the order of ``pairs``.
+        Return the refitted models, keyed by the names of the two rivals.
 
         Args:
             prints: planned prints. The refit is not differentiable with respect to the levels of these
                 prints.
             rounds: number of Gauss-Newton steps. With a single step, the refit is linear.
-            first: the result of ``linearised`` for these prints, if it has already been computed.
+            first: for each scan of these prints, the result of ``linearised`` for ``twins``, if it has
+                already been computed.
         """
-        predicted = [self._predict(chain, prints) for chain in self.true]
-        first = first or self.linearised(prints)
-        found = []
-        for true, other in self.pairs:
+        scans = [scan for scans in prints for scan in scans]
+        first = first or [linearised(self.twins, scan) for scan in scans]
+        shown = {name: _rows(_predicted(twin, prints)) for name, twin in self.true.items()}
+        priors = {rival.name: np.array(rival.information) for rival in self.question.rivals}
+        found = {}
+        for true, other in permutations(self.twins, 2):
             start = twin = self.twins[other]
-            prior = np.array(self.question.rivals[other].information)
             for number in range(rounds):
-                here = self._linearise(twin, prints) if number else first[other]
+                here = [linearised({other: twin}, scan) for scan in scans] if number else first
                 linear = [
-                    replace(part, residual=part.residual + _flat(wanted))
-                    for part, wanted in zip(here, predicted[true], strict=True)
+                    replace(one[other], residual=one[other].residual + height)
+                    for one, height in zip(here, shown[true], strict=True)
                 ]
                 normal, right, _ = eliminated_sum(linear, RULES.term_weight)
-                right = right - prior @ (twin.vector - start.vector)
-                twin = twin.at(twin.vector + solve_damped(normal + prior, right, _DAMPING, twin.room()))
-            found.append(_chain(twin))
+                right = right - priors[other] @ (twin.vector - start.vector)
+                step = solve_damped(normal + priors[other], right, _DAMPING, twin.room())
+                twin = twin.at(twin.vector + step)
+            found[true, other] = twin
         return found
 
-    def linearised(self, prints: Sequence[PlannedPrint]) -> list[list[Linearised]]:
-        """Linearise the models of all rivals at the parameters from which a refit starts. Return one list per
-        model, with one linear problem per scan.
-        """
-        # Rivals with the same base model share its predictions.
-        known: list[Fields] = [{} for one in prints for _ in one.ways]
-        return [self._linearise(twin, prints, known) for twin in self.twins]
-
-    def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
+    def contrasts(self, prints: Sequence[Print], refitted: Mapping[Pair, Twin]) -> dict[Pair, Contrast]:
         """Return the contrast of every ordered pair of rivals on the given prints. The argument ``refitted``
         is the result of the method ``refitted`` for these prints. The contrasts are differentiable with
         respect to the levels of the prints.
         """
-        true = [self._predict(chain, prints) for chain in self.true]
-        return [
-            self._contrast(true[first], self._predict(partner, prints), prints)
-            for (first, _), partner in zip(self.pairs, refitted, strict=True)
-        ]
+        shown = {name: _predicted(twin, prints) for name, twin in self.true.items()}
+        found = {}
+        for (true, other), twin in refitted.items():
+            pairs = zip(shown[true], _predicted(twin, prints), strict=True)
+            freed = NM_PER_UM * torch.stack([_freed(*pair) for pair in pairs])
+            freed = freed.reshape(len(prints), -1, *shown[true].shape[1:])
+            # All scans of a print show the same roughness. The difference maps of these scans are therefore
+            # added before the noise is computed.
+            together = freed.sum(1)
+            sd = torch.sqrt(4 * self.noise.variance(together) + _SMALLEST**2)
+            found[true, other] = Contrast((freed**2).sum((1, 2, 3)), sd, freed[0].numel())
+        return found
 
-    def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Return the separation of each ordered pair of rivals, in standard deviations. The result has shape
-        (pairs,) and is differentiable with respect to the levels of the prints.
+    def separations(self, prints: Sequence[Print], refitted: Mapping[Pair, Twin]) -> Tensor:
+        """Return the separation of each ordered pair of rivals, i.e. the squared distance between the two
+        predictions in units of its standard deviation. The distance varies with the noise and, between
+        prints, with the relative standard deviation ``question.spread``. The result has shape (pairs,) and is
+        differentiable with respect to the levels of the prints.
         """
-        return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
-
-    def _contrast(
-        self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
-    ) -> Contrast:
-        """Compare the predictions of two models for the given prints. All scans of a print show the same
-        roughness. The difference maps of these scans are therefore added before the noise is computed.
-        """
-        found, scans = [], iter(zip(true, other, strict=True))
-        for printed in prints:
-            squares, together, pixels = torch.zeros(()), torch.zeros(()), 0
-            for _ in printed.ways:
-                right, refitted = next(scans)
-                # The scan terms are computed from the refitted prediction. If the gain term were computed
-                # from the true prediction, the refitted prediction could shrink to zero.
-                basis = torch.from_numpy(_free_basis(refitted.detach())).to(right)
-                inner = _inner(right - refitted)
-                flat = inner.reshape(-1)
-                freed = (flat - basis @ (basis.T @ flat)).reshape(inner.shape)
-                squares, together = squares + (freed**2).sum(), together + freed
-                pixels += flat.numel()
-            power = torch.from_numpy(self.noise.on_grid(together.shape)).to(together) / NM_PER_UM**2
-            variance = 4 * (torch.fft.fft2(together).abs() ** 2 * power).sum() / together.numel()
-            found.append((squares, torch.sqrt(variance + _SMALLEST**2), torch.tensor(float(pixels))))
-        return Contrast(*map(torch.stack, zip(*found, strict=True)))
-
-    def _predict(self, chain: EffectChain, prints: Sequence[PlannedPrint]) -> list[Tensor]:
-        return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
-
-    def _linearise(
-        self, twin: Twin, prints: Sequence[PlannedPrint], known: Sequence[Fields] | None = None
-    ) -> list[Linearised]:
-        """Linearise the predictions of a model for each scan of the prints. The residual in the result is the
-        negative of the predicted height. The caller must add the heights to which the model is fitted.
-        ``known`` is a cache of intermediate fields of each scan.
-        """
-        scans = [(one, way) for one in prints for way in one.ways]
-        known = known or [{} for _ in scans]
-
-        def predicted(own: Twin) -> list[Tensor]:
-            chain, key = _chain(own), own.numbers.tobytes()
-            pairs = zip(scans, known, strict=True)
-            return [self.printing.predict(chain, *scan, fields, key) for scan, fields in pairs]
-
-        steps = twin.steps()
-        here = predicted(twin)
-        aside = [predicted(twin.at(twin.vector + one)) for one in np.diag(steps)]
-        return [
-            Linearised(
-                -_flat(height),
-                np.stack([_flat(own[at] - height) for own in aside]) / steps[:, None],
-                _free_basis(height).T,
-            )
-            for at, height in enumerate(here)
-        ]
+        found = []
+        for one in self.contrasts(prints, refitted).values():
+            variance = (one.sd_nm2**2 + (self.question.spread * one.squares_nm2) ** 2).sum()
+            found.append(one.squares_nm2.sum() / torch.sqrt(variance + _SMALLEST**2))
+        return torch.stack(found)
 
 
-def _chain(twin: Twin) -> EffectChain:
-    return twin.chain().requires_grad_(False)
-
-
-def _inner(field: Tensor) -> Tensor:
-    """Crop the border of a field, where the prediction depends on surroundings that are not part of the
-    field.
+def _predicted(twin: Twin, prints: Sequence[Print]) -> Tensor:
+    """Predict the height in all scans of the prints, without its border. The result has shape (scans, ny,
+    nx).
     """
-    border = sample_border_px(min(field.shape))
-    return field[border:-border, border:-border]
+    return _inner(torch.stack([predict(twin, scan) for scans in prints for scan in scans]))
 
 
-def _flat(field: Tensor) -> np.ndarray:
-    return _inner(field).reshape(-1).numpy().astype(np.float64)
+def _inner(fields: Tensor) -> Tensor:
+    """Crop the border of fields of shape (n, ny, nx), where the prediction depends on surroundings that are
+    not part of the field.
+    """
+    border = sample_border_px(min(fields.shape[1:]))
+    return fields[:, border:-border, border:-border]
+
+
+def _rows(fields: Tensor) -> np.ndarray:
+    return fields.flatten(1).double().numpy()
 
 
 def _free_basis(prediction_um: Tensor) -> np.ndarray:
-    """Return an orthonormal basis of the k terms that are fitted to each scan, at the n interior pixels of
-    the scan. The result has shape (n, k).
+    """Return an orthonormal basis of the k terms that are fitted to each scan, at the n pixels of a
+    prediction. The result has shape (n, k).
     """
-    return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)
+    return orthonormal(term_maps(TermPixels(prediction_um.detach().numpy()), ALL_FREE).T)
+
+
+def _freed(true_um: Tensor, refitted_um: Tensor) -> Tensor:
+    """Project the terms that are fitted to each scan out of the difference between two predictions.
+
+    The terms are computed from the refitted prediction. If the gain term were computed from the true
+    prediction, the refitted prediction could shrink to zero.
+    """
+    basis = torch.from_numpy(_free_basis(refitted_um)).to(true_um)
+    flat = (true_um - refitted_um).flatten()
+    return flat - basis @ (basis.T @ flat)

@@ -38,9 +38,8 @@ from litho_models.loop.single_scans import coefficients
 from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
 from litho_models.planning.open_questions import open_questions
 from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
-from litho_models.scan_terms import freed_um, terms_of_effect
-from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
-from litho_models.scan_terms.term import row_index
+from litho_models.scan_terms import freed_um, row_index, shrunk_line_offsets, terms_of_effect
+from litho_models.scan_terms.lines import axis_along
 
 NONE: Decided = "none of them"
 UNSEEN: Decided = "not shown by these prints"
@@ -70,14 +69,12 @@ def close_loop(
         InputError: as in ``loop.run.close_loop``; also if a further store is of another printer, or if a scan
             has another orientation than its dataset card states.
     """
-    first = open_store(store)
-    new, dropped, used = list[PrintedScan](), list[str](), list[str]()
-    for path in new_prints:
-        further = open_store(path)
-        scans, texts = new_scans(first, further)
+    first, *further = map(open_store, (store, *new_prints))
+    new, dropped = list[PrintedScan](), list[str]()
+    for one in further:
+        scans, texts = new_scans(first, one)
         new += scans
         dropped += texts
-        used.append(further.sha256)
 
     def asked(
         closed: Closed, single_scans: Sequence[ScanFinding]
@@ -86,6 +83,7 @@ def close_loop(
         decisions = decide(closed, open_, new) if new else []
         return with_decisions(closed, open_, decisions), decisions, [open_]
 
+    used = [one.sha256 for one in further]
     return run.close_loop(store, out, further=asked, decided_by=used, left_out=dropped, **settings)
 
 
@@ -169,14 +167,13 @@ class Judge:
         """Fit every rival (competing explanation) of the question to the old and new scans. Also fit a model
         without the effect in question. Then judge these fits on the new scans.
         """
-        twins = [rival.twin(self.twin) for rival in question.rivals]
-        without = twins[0].without(question.rivals[0].effect)
-        names = [*(rival.name for rival in question.rivals), NONE]
-        twins.append(without)
-        left = {}
+        twins = {rival.name: rival.twin(self.twin) for rival in question.rivals}
+        first = question.rivals[0]
+        twins[NONE] = twins[first.name].without(first.effect)
         windows = [*self.study.windows, *(scan.window for scan in self.new)]
-        for name, twin, fit in zip(names, twins, fit_rivals(twins, windows), strict=True):
-            fitted = twin.at(fit.vector)
+        left = {}
+        for name, fit in fit_rivals(twins, windows).items():
+            fitted = twins[name].at(fit.vector)
             left[name] = [left_nm(scan, fitted.height(scan)) for scan in self.new]
         return compared(question, self.new, left)
 
@@ -186,11 +183,10 @@ class Judge:
         """
         own = terms_of_effect(question.name)
         maps = [self.twin.height(scan) for scan in self.new]
-        by_print: dict[str, list[np.ndarray]] = {}
         found = coefficients(self.new, maps, own, own | {"offset", "gain", "bow"})
-        for scan, values in zip(self.new, found, strict=True):
-            by_print.setdefault(scan.stored.print_id, []).append(values)
-        repeated = [np.array(one) for one in by_print.values() if len(one) > 1]
+        prints = np.array([scan.stored.print_id for scan in self.new])
+        by_print = [found[prints == one] for one in np.unique(prints)]
+        repeated = [one for one in by_print if len(one) > 1]
         count, total = len(repeated), sum(map(len, repeated))
         if count < 2:
             return _decision(question, self.new, BOTH, "no print was scanned twice", UNSEEN)
@@ -214,9 +210,10 @@ class Judge:
             return _decision(question, self.new, BOTH, "no scan is rotated", UNSEEN)
         rows, lines = [], 0
         for scan in turned:
-            used, index = scan.usable, row_index(scan.usable.shape)
+            used = scan.usable
             residual = freed_um(scan.stored.height_um, self.twin.height(scan), used, frozenset({"offset"}))
-            offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in (index, scan.line))
+            indices = row_index(used.shape), scan.line
+            offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in indices)
             rows.append([*offsets, residual[used].var() / used.shape[1]])
             lines += len(used)
         written, scanned, own = 1e6 * np.mean(rows, axis=0)
@@ -276,11 +273,12 @@ def compared(
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
     # As in the loop, a difference that is smaller than the fraction ``SMALLEST_SHARE`` of the squared error
     # does not count, because it may come from effects that are not among the rivals.
-    least = {
-        name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
-        for name, own in left_nm.items()
+    squares_nm2 = {name: np.mean([np.nanmean(one**2) for one in own]) for name, own in left_nm.items()}
+    excluded = {
+        one.worse
+        for one in comparisons
+        if one.z >= Z_DECIDED and one.gain_nm2 >= SMALLEST_SHARE * squares_nm2[one.better]
     }
-    excluded = {c.worse for c in comparisons if c.z >= Z_DECIDED and c.gain_nm2 >= least[c.better]}
     left = [name for name in left_nm if name not in {*excluded, NONE}]
     told = [
         f"{one.better} fits better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})"
@@ -294,8 +292,7 @@ def compared(
             f"remaining rivals differ by {nearest_nm:.1f} nm"
         )
     nothing = not left or (NONE not in excluded and len(left) == 1)
-    decision = _decision(question, new, left, "; ".join(told), NONE if nothing else None)
-    return decision.model_copy(update={"comparisons": comparisons})
+    return _decision(question, new, left, "; ".join(told), NONE if nothing else None, comparisons)
 
 
 def _compare(
@@ -322,20 +319,21 @@ def _compare(
     # this mean counts as noise.
     noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
     prints = len({name for name, _ in by_print})
-    sd = float(np.sqrt(noise + (question.spread * total) ** 2 / prints))
-    form = pixels * (question.form_nm or 0.0) ** 2
     return Comparison(
         better=pair[total < 0],
         worse=pair[total >= 0],
         gain_nm2=abs(total) / max(pixels, 1),
-        z=surely_better(abs(total), difference, sd, form),
+        z=surely_better(question, abs(total), difference, noise, prints, pixels),
         difference_nm=float(np.sqrt(difference / max(pixels, 1))),
     )
 
 
 def _block_sums(gain: np.ndarray) -> np.ndarray:
-    rows, columns = (np.arange(max(2, n // _BLOCK_PX)) * n // max(2, n // _BLOCK_PX) for n in gain.shape)
-    return np.add.reduceat(np.add.reduceat(np.nan_to_num(gain), rows, axis=0), columns, axis=1)
+    sums = np.nan_to_num(gain)
+    for axis, size in enumerate(gain.shape):
+        count = max(2, size // _BLOCK_PX)
+        sums = np.add.reduceat(sums, np.arange(count) * size // count, axis=axis)
+    return sums
 
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
@@ -352,6 +350,7 @@ def _decision(
     left: Sequence[str],
     evidence: str,
     verdict: Decided | None = None,
+    comparisons: Sequence[Comparison] = (),
 ) -> Decision:
     """Make the record of the decision on a question.
 
@@ -362,6 +361,7 @@ def _decision(
         evidence: the evidence, in words.
         verdict: the verdict. If it is None, the question is decided if one answer remains, and otherwise
             still open.
+        comparisons: the comparisons of the answers.
     """
     return Decision(
         question=question.name,
@@ -372,4 +372,5 @@ def _decision(
         evidence=evidence,
         prints=len({scan.stored.print_id for scan in scans}),
         scans=len(scans),
+        comparisons=list(comparisons),
     )

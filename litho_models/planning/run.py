@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
-from litho_data.cards.card import Use
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
@@ -23,32 +22,22 @@ from litho_data.foundation.run_facts import run_info
 from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import flat, framed_ladder
 from litho_data.reports.page import filled
+from litho_models.effects import FieldContext
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
 from litho_models.loop.run import MODEL_FOLDER
 from litho_models.planning.answers import of_others, of_rivals
-from litho_models.planning.layouts import (
-    STEPS,
-    TILE_PX,
-    TURNED,
-    WORDS,
-    Limits,
-    as_tensor,
-    assemble,
-    choose,
-    climbed,
-    together,
-)
+from litho_models.planning.layouts import Limits, assemble, choose, climbed, starts, together
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint, PlannedScan
 from litho_models.planning.report import write_report
-from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.planning.rivalry import TURNED, Print, Rivalry
 
 # Number of planned prints on which the rivals (competing explanations) are finally compared. More prints are
 # not needed for this comparison, because they consist of the same tiles.
 _JUDGED = 2
 _FEWEST_PRINTS, _TILES = 2, 4
-_SMALLEST_PX = 64
+_TILE_PX, _SMALLEST_PX = 256, 64
 PRINT_PATTERN = r"N(?P<print>\d+)F\d+"
 PRINTER_SHEET, MICROSCOPE_SHEET = "printer.md", "microscope.md"
 _TEMPLATES = Path(__file__).parent
@@ -61,10 +50,6 @@ HOLDS = (
     "*.csv",
     PRINTER_SHEET,
     MICROSCOPE_SHEET,
-)
-_COLUMNS = (
-    *("id", "order", "field_x_um", "field_y_um", "dose", "use"),
-    *("turned_deg", "direction", "tip", "pixel_size"),
 )
 _REFERENCES = {
     "substrate": "shows zero, tilt and bow without a print",
@@ -92,7 +77,7 @@ def next_print(
     prints: int = 4,
     field_um: float = 51.2,
     seed: int = 0,
-    steps: int = STEPS,
+    steps: int = 40,
     layouts: Literal["optimised", "random"] = "optimised",
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
@@ -142,52 +127,49 @@ def next_print(
     with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
         base = load_simulator(folder / MODEL_FOLDER, card)
         limits = Limits.of(open_, card.pitch_um)
-        written = open_.write_field_um, open_.slow_axis
-        printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, *written)
-        rivalries = [Rivalry(one, base, printing, open_.noise) for one in open_.questions if one.rivals]
-        tile_px = min(TILE_PX, size_px)
-        can_move = open_.write_field_um is not None and open_.write_field_um > field_um
-        choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
+        geometry = base.config
+        plain = FieldContext(
+            torch.zeros(1, 1, size_px, size_px),
+            geometry.pitch_um,
+            geometry.full_height_um,
+            geometry.level_height_um,
+            field_radius_um=open_.write_field_um and open_.write_field_um / 2,
+            slow_axis=open_.slow_axis,
+        )
+        rivalries = {one.name: Rivalry(one, base, open_.noise) for one in open_.questions if one.rivals}
+        tile_px = min(_TILE_PX, size_px)
+        first = limits.random(tile_px, seed)
+        choices = {name: choose(rivalry, first, plain) for name, rivalry in rivalries.items()}
         # A scan rotated by 90 degrees is also a repeated scan, because the print is remounted for it.
-        turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
-        chosen = together(choices, turned)
+        repeated = any(one.kind in ("lines", "per-scan") for one in open_.questions)
+        chosen = together(choices.values(), [TURNED] * repeated)
         count = _TILES if size_px > tile_px else prints
-        tiles = [limits.random(tile_px, seed + 31 + i) for i in range(count)]
         # The finished tiles of an interrupted run are stored here.
         cache = Path(f"{out}-cache")
         if rivalries and layouts == "optimised":
             kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
-            tiles = climbed(
-                rivalries, chosen, limits, tile_px, count, seed=seed, steps=steps, kept=kept, report=report
-            )
-        planned = [
-            PlannedPrint(
-                as_tensor(assemble(tiles, number, size_px, limits)),
-                chosen.ways,
-                chosen.places[number % len(chosen.places)],
-                number / max(prints - 1, 1) - 0.5,
-                chosen.doses[number % len(chosen.doses)],
-            )
-            for number in range(prints)
-        ]
+            begun = starts(tile_px, limits, seed)
+            every = [*rivalries.values()]
+            tiles = climbed(every, chosen, begun, limits, plain, count, steps=steps, kept=kept, report=report)
+        else:
+            tiles = [limits.random(tile_px, seed + 31 + i) for i in range(count)]
+        levels = [assemble(tiles, number, size_px, limits) for number in range(prints)]
+        planned = chosen.prints(levels, plain, prints)
         report("comparing the rivals on the planned prints, and on random ones")
         judged = planned[:_JUDGED]
-        random = [
-            replace(one, level=as_tensor(limits.random(size_px, seed + 101 + i)))
-            for i, one in enumerate(judged)
-        ]
-        answered = {
-            rivalry.question.name: of_rivals(rivalry, choice.tried, judged, random, prints)
-            for rivalry, choice in zip(rivalries, choices, strict=True)
-        }
+        unplanned = [limits.random(size_px, seed + 101 + i) for i in range(len(judged))]
+        random = chosen.prints(unplanned, plain, prints)
         questions = [
-            answered.get(one.name) or of_others(one, open_, prints, len(chosen.ways), size_px)
+            of_rivals(rivalries[one.name], choices[one.name].tried, judged, random, prints)
+            if one.rivals
+            else of_others(one, open_, prints, len(chosen.ways), size_px)
             for one in open_.questions
         ]
         needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
         # At least two prints are planned, because a single print may have a defect.
         planned = planned[: max([_FEWEST_PRINTS, *needed])]
-        scans, maps = schedule(planned, limits, printing, seed)
+        levels = levels[: len(planned)]
+        scans, maps = schedule(planned, levels, chosen.ways, limits, plain, seed)
         plan = NextPrint(
             run=run_info([seed], len(scans)),
             dataset=open_.dataset,
@@ -198,19 +180,24 @@ def next_print(
             scans=scans,
             questions=questions,
         )
-        write_plan(target, plan, maps, printing, open_)
-        write_report(target, plan, rivalries, planned)
+        write_plan(target, plan, maps, card, open_)
+        write_report(target, plan, levels, rivalries, planned[0][-1])
     shutil.rmtree(cache, ignore_errors=True)
     return plan
 
 
 def schedule(
-    planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
+    planned: Sequence[Print],
+    levels: Sequence[np.ndarray],
+    ways: Sequence[str],
+    limits: Limits,
+    plain: FieldContext,
+    seed: int,
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
     """Return the planned scans, which are the rows of the table ``scans.csv``, and the level map of each
     scan. The scans of the four references (substrate, flat, steps and grating) come first.
     """
-    size_px = len(planned[0].level)
+    size_px = len(levels[0])
     # A staircase looks the same when it is shifted, so its position could not be determined. It is therefore
     # surrounded by a random frame if there is room.
     ladder = limits.random(size_px, seed + 13)
@@ -218,55 +205,57 @@ def schedule(
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
     unprinted = flat((size_px, size_px), level=0)
     middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)
-    plain = PlannedPrint(planned[0].level, ())
-    references: dict[Use, np.ndarray] = {
-        "substrate": unprinted, "flat": middle, "steps": ladder, "grating": unprinted,
-    }  # fmt: skip
-    rows = [
-        (use, 0, at, level, plain, Way(), _REFERENCES[use])
-        for at, (use, level) in enumerate(references.items(), start=1)
-    ]
-    for number, one in enumerate(planned, start=1):
-        level = one.level.numpy().astype(np.min_scalar_type(limits.highest))
-        weaker = f"; the print has {one.dose:g} of the dose" if one.dose != 1 else ""
-        for at, way in enumerate(one.ways, start=1):
-            why = WORDS.get(way, "like the earlier prints") + weaker
-            rows.append(("dataset", number, at, level, one, way, why))
-    scans = [
-        PlannedScan(
-            id=f"N{number}F{at}",
-            print=str(number),
-            order=order,
-            use=use,
-            **vars(way),
-            field_x_um=printing.reach_um(one),
-            field_y_um=printing.reach_um(one),
-            dose=one.dose,
-            why=why,
-        )
-        for order, (use, number, at, _, one, way, why) in enumerate(rows)
-    ]
-    return scans, [level for _, _, _, level, *_ in rows]
+    references = [unprinted, middle, ladder, unprinted]
+    groups = [[(use, plain, why) for use, why in _REFERENCES.items()]]
+    groups += [[("dataset", *one) for one in zip(own, ways, strict=True)] for own in planned]
+    scans: list[PlannedScan] = []
+    for number, group in enumerate(groups):
+        for at, (use, scan, why) in enumerate(group, start=1):
+            y_um, x_um = scan.field_centre_um
+            scans.append(
+                PlannedScan(
+                    id=f"N{number}F{at}",
+                    print=str(number),
+                    order=len(scans),
+                    use=use,
+                    turned_deg=90 * scan.quarter_turns,
+                    direction=-1 if scan.backward else 1,
+                    tip=2 if scan.new_tip else 1,
+                    pixel_size=scan.pixel_size,
+                    field_x_um=x_um,
+                    field_y_um=y_um,
+                    dose=scan.dose,
+                    why=why + f"; the print has {scan.dose:g} of the dose" * (scan.dose != 1),
+                )
+            )
+    return scans, [*references, *(level for level in levels for _ in ways)]
 
 
 def write_plan(
-    folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing, open_: OpenQuestions
+    folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], card: ModelCard, open_: OpenQuestions
 ) -> None:
     """Write the files of a plan: the dataset card, the table of scans, the layouts, the record, and the
     sheets for printer and microscope.
 
-    ``layouts`` contains the level map of each scan.
+    Args:
+        folder: folder of the plan.
+        plan: the record.
+        layouts: the level map of each scan.
+        card: card of the corrected model, which states the pitch and the levels of the prints.
+        open_: the open questions of the closed loop.
     """
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
-    write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])
+    rows = [scan.model_dump(exclude={"print", "why"}) for scan in plan.scans]
+    write_table(folder, [*rows[0]], [[*row.values()] for row in rows])
+    grating_um = next((one for one in _PERIODS_UM if _FEWEST_PERIODS * one <= plan.field_um), _PERIODS_UM[-1])
     write_card(
         folder,
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide the open questions on {plan.dataset.name}",
-        pitch_um=printing.pitch_um,
-        level_height_um=printing.level_height_um,
-        levels=printing.highest + 1,
+        pitch_um=card.pitch_um,
+        level_height_um=card.level_height_um,
+        levels=card.levels,
         scan_size_um=(plan.field_um, plan.field_um),
         ids={"print": PRINT_PATTERN, "table": TABLE_NAME},
         instrument=open_.instrument,
@@ -276,15 +265,11 @@ def write_plan(
             "surround": open_.surround,
         },
         plan={"dataset_sha256": plan.dataset.sha256},
-        grating={"period_um": _grating_um(plan)},
+        grating={"period_um": grating_um},
     )
     plan.write(folder)
     for name in (PRINTER_SHEET, MICROSCOPE_SHEET):
-        known = {"plan": plan, "uses": _USES, "grating_um": _grating_um(plan), "slow_axis": open_.slow_axis}
-        sheet = filled(_TEMPLATES / f"{name}.jinja", **known)
+        template = _TEMPLATES / f"{name}.jinja"
+        text = filled(template, plan=plan, uses=_USES, grating_um=grating_um, slow_axis=open_.slow_axis)
         with atomic_file(folder / name) as temporary:
-            temporary.write_text(sheet, encoding="utf-8")
-
-
-def _grating_um(plan: NextPrint) -> float:
-    return next((one for one in _PERIODS_UM if _FEWEST_PERIODS * one <= plan.field_um), _PERIODS_UM[-1])
+            temporary.write_text(text, encoding="utf-8")

@@ -26,11 +26,11 @@ from litho_models.effects import FieldContext, get_effect
 from litho_models.loop.prepared import prepare_scans
 from litho_models.planning.layouts import Limits, score
 from litho_models.planning.questions import Question
-from litho_models.planning.rivalry import Printing, Rivalry, Way
+from litho_models.planning.rivalry import PLAIN, TURNED, Rivalry
 from tests.litho_models.loop_scans import base_model, blank_scans
-from tests.litho_models.test_next_print import first_layout, opened, rival, white
+from tests.litho_models.test_next_print import first_print, opened, rival, white
 
-FINE = Way(pixel_size=0.5)
+FINE = "with half the pixel size and the same time per pixel"
 
 
 @pytest.mark.parametrize("pixel_size", [1.0, 0.5])
@@ -88,10 +88,9 @@ def test_smaller_pixels_tell_a_blur_of_the_resist_from_one_of_the_scan() -> None
         experiment="smaller pixels",
         rivals=[rival(name, {name: values}) for name, values in blurs.items()],
     )
-    rivalry = Rivalry(question, base_model(), Printing(0.1, 0.1, 12), white())
-    level = first_layout(Limits.of(opened([]), 0.1))
-    ways = (Way(),), (Way(), Way(turned_deg=90)), (Way(), FINE)
-    plain, twice, fine = (score(rivalry, level, one) for one in ways)
+    rivalry, limits = Rivalry(question, base_model(), white()), Limits.of(opened([]), 0.1)
+    ways = (PLAIN,), (PLAIN, TURNED), (PLAIN, FINE)
+    plain, twice, fine = (score(rivalry, [first_print(limits, ways=one)]) for one in ways)
     assert max(plain, twice) < 0.1
     assert fine > 5
 

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, cast
@@ -46,7 +47,7 @@ from litho_models.loop.search import Cause, Found
 from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
-from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
+from litho_models.planning.layouts import Limits, assemble, climb, score, starts
 from litho_models.planning.open_questions import _Asking, _cutoff_per_um, _owners, _question, open_questions
 from litho_models.planning.questions import (
     NoiseSpectrum,
@@ -59,7 +60,15 @@ from litho_models.planning.questions import (
     noise_spectrum,
 )
 from litho_models.planning.record import NextPrint, PlannedQuestion
-from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
+from litho_models.planning.rivalry import (
+    PLAIN,
+    TURNED,
+    Contrast,
+    Print,
+    Rivalry,
+    planned_scans,
+    predict,
+)
 from litho_models.planning.rounds import (
     MICROSCOPE,
     NONE,
@@ -90,7 +99,9 @@ SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
 NOISE_NM = 10.0
 DOCS = Path(__file__).parents[2] / "docs"
-TURNED = (Way(), Way(turned_deg=90))
+TWICE = (PLAIN, TURNED)
+# The facts that all planned prints share.
+SHARED = FieldContext(torch.zeros(1, 1, 8, 8), 0.1, 1.2, 0.1)
 # This transform rotates a scan of a print of 6.4 µm by 90°.
 QUARTER = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -145,7 +156,7 @@ def opened(questions: list[Question]) -> OpenQuestions:
 
 @pytest.fixture(scope="module")
 def rivalry() -> Rivalry:
-    return Rivalry(slope_question(), base_model(), Printing(0.1, 0.1, 12), white())
+    return Rivalry(slope_question(), base_model(), white())
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +171,11 @@ def closed_loop(folder: Path, questions: list[Question]) -> Path:
 
 
 def first_layout(limits: Limits, size_px: int = 96) -> np.ndarray:
-    return next(starts(size_px, limits, 3))[1]
+    return starts(size_px, limits, 3)["random-1"]
+
+
+def first_print(limits: Limits, size_px: int = 96, ways: Sequence[str] = TWICE) -> Print:
+    return planned_scans(SHARED, first_layout(limits, size_px), ways)
 
 
 # --- scans that are rotated, recorded backwards, or made with another tip
@@ -239,7 +254,8 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
         change = gaussian_filter(random.normal(size=(80, 80)), sigma, mode="wrap")
         draws = [1e3 * scale * np.sum(change * rough()) for _ in range(400)]
         # The standard deviation of 400 draws is known to 3.5 %, and the spectrum to about 10 %.
-        assert spectrum.along(change) == pytest.approx(np.std(draws) / np.linalg.norm(change), rel=0.2)
+        sd = math.sqrt(spectrum.variance(torch.from_numpy(change)))
+        assert sd == pytest.approx(np.std(draws), rel=0.2)
 
 
 @pytest.mark.parametrize("scans", [1, 2])
@@ -247,26 +263,26 @@ def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rival
     """Check that the sum of several scans of one print has more noise, because these scans share the noise of
     the print.
     """
-    prints = [PlannedPrint(as_tensor(first_layout(limits)), (Way(),) * scans)]
-    plain = model({}).chain().requires_grad_(False)
-    found = rivalry.contrasts(prints, [plain] * len(rivalry.pairs))[0]
+    prints = [first_print(limits, ways=[PLAIN] * scans)]
+    [found] = rivalry.contrasts(prints, {(AS_PRINTER, AS_MICROSCOPE): model({})}).values()
     # The difference is computed in single precision.
     assert found.noise_nm == pytest.approx(NOISE_NM * math.sqrt(scans), rel=1e-4)
 
 
 def test_only_a_turned_scan_separates_printer_from_microscope(rivalry: Rivalry, limits: Limits) -> None:
-    level = first_layout(limits)
     # In scans that are not rotated, both models are equal, except for rounding in the refit.
-    assert score(rivalry, level, (Way(),)) < 1e-3
-    assert score(rivalry, level, TURNED) > 5
+    assert score(rivalry, [first_print(limits, ways=[PLAIN])]) < 1e-3
+    assert score(rivalry, [first_print(limits)]) > 5
 
 
 def test_the_linearised_refit_comes_near_the_full_one(rivalry: Rivalry, limits: Limits) -> None:
-    prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), TURNED)]
-    one, full = (
-        rivalry.contrasts(prints, rivalry.refitted(prints, rounds=rounds))[0].rms_nm for rounds in (1, 6)
+    prints, pair = [first_print(limits)], (AS_PRINTER, AS_MICROSCOPE)
+    refits = (
+        rivalry.refitted(prints, rounds=1),
+        rivalry.refitted(prints, rounds=6),
+        {pair: rivalry.twins[AS_MICROSCOPE]},
     )
-    plain = rivalry.contrasts(prints, [rivalry.chains[b] for _, b in rivalry.pairs])[0].rms_nm
+    one, full, plain = (rivalry.contrasts(prints, refitted)[pair].rms_nm for refitted in refits)
     # The refit explains much of the difference, and its first step finds nearly all of this.
     assert full < 0.9 * plain
     assert one == pytest.approx(full, rel=0.1)
@@ -276,23 +292,20 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
     """Check that the gain of each scan scales the refitted model. If it scaled the true print, it would
     explain everything.
     """
-    prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
-    twin = rivalry.twins[0]
+    prints = [first_print(limits, ways=[PLAIN])]
+    twin = rivalry.twins[AS_PRINTER]
     slot = [name for name, _ in twin.base.named_parameters()].index("weights")
-    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).chain()
-    faded.requires_grad_(False)
-    found = rivalry.contrasts(prints, [faded] * len(rivalry.pairs))[0].rms_nm
-    with torch.no_grad():
-        plain = model({}).chain()
-        heights = [rivalry.printing.predict(one, prints[0], Way()) for one in (rivalry.chains[0], plain)]
+    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector))
+    [found] = rivalry.contrasts(prints, {(AS_PRINTER, AS_MICROSCOPE): faded}).values()
+    heights = [predict(one, prints[0][0]) for one in (twin, model({}))]
     # Gain, registration, tilt and bow explain some of the loss on slopes, but less than two thirds.
-    assert found > 1e3 * float((heights[0] - heights[1]).std()) / 3
+    assert found.rms_nm > 1e3 * float((heights[0] - heights[1]).std()) / 3
 
 
 def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: Limits) -> None:
     """Check a question whose answer rests on the small difference between the losses along the two axes."""
     nearly_equal = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.18, "exponent": 2.0}}
-    prints = [PlannedPrint(as_tensor(first_layout(limits)), TURNED)]
+    prints = [first_print(limits)]
 
     def powers(sd_um: float) -> list[float]:
         rivals = []
@@ -303,7 +316,7 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
             covariance[-3, -3] = sd_um**2
             rivals.append(own.model_copy(update={"covariance": covariance.tolist()}))
         asked = slope_question(rivals=rivals)
-        [pair] = _pairs(Rivalry(asked, base_model(), Printing(0.1, 0.1, 12), white()), prints)
+        [pair] = _pairs(Rivalry(asked, base_model(), white()), prints)
         return pair.power
 
     sure, unsure = powers(0.0), powers(0.02)
@@ -315,7 +328,7 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
 
 def test_a_small_print_can_start_from_layouts_as_coarse_as_the_prints_so_far() -> None:
     coarse = replace(Limits.of(opened([]), 0.1), cutoff_per_um=0.25)
-    assert all(np.ptp(level) > 0 for _, level in starts(64, coarse, 0))
+    assert all(np.ptp(level) > 0 for level in starts(64, coarse, 0).values())
 
 
 def test_layouts_of_a_single_level_have_no_structure_and_no_plan(tmp_path: Path) -> None:
@@ -346,10 +359,11 @@ def test_finer_levels_leave_the_range_of_heights(finer: int) -> None:
 
 
 def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:
-    start = first_layout(limits)
-    soft = climb(rivalry, start, TURNED, limits, steps=10)
-    level = limits.whole(soft)
-    assert score(rivalry, level, TURNED) > 1.05 * score(rivalry, start, TURNED)
+    start, scans_of = first_layout(limits), partial(planned_scans, SHARED, ways=TWICE)
+    soft = climb(rivalry, start, scans_of, limits, steps=10)
+    level = assemble([soft], 0, len(soft), limits)
+    assert level.dtype == np.uint8
+    assert score(rivalry, [scans_of(level)]) > 1.05 * score(rivalry, [scans_of(start)])
     assert limits.lowest <= level.min()
     assert level.max() <= limits.highest
     spectrum = np.abs(np.fft.fft2(soft - soft.mean())) ** 2
@@ -466,9 +480,8 @@ def test_written_lines_run_in_a_plan_as_in_the_loop(slow_axis: Literal["x", "y"]
     """Check an effect of the written lines on a planned print and on the same print in the loop."""
     scan = blank_scan(0, write={"slow_axis": slow_axis})
     twin = model({"galvo-lag": get_effect("galvo-lag").trials[0]})
-    printed = PlannedPrint(as_tensor(scan.mask_level), (Way(),))
-    with torch.no_grad():
-        planned = Printing(0.1, 0.1, 12, slow_axis=slow_axis).predict(twin.chain(), printed, Way())
+    [printed] = planned_scans(replace(SHARED, slow_axis=slow_axis), scan.mask_level, [PLAIN])
+    planned = predict(twin, printed)
     seen = twin.height(*prepare_scans([scan]))
     assert np.abs(planned.numpy() - seen).max() < 1e-6
     other = twin.height(*prepare_scans([replace(scan, write={"slow_axis": "xy"[slow_axis == "x"]})]))
@@ -708,19 +721,23 @@ def test_scans_of_one_print_may_differ_in_size() -> None:
 
 
 def test_a_gain_counts_only_beyond_what_an_error_of_the_form_can_cause() -> None:
+    def z_of(gain: float, sd: float, form: float | None) -> float:
+        form_nm = None if form is None else math.sqrt(form)
+        return surely_better(slope_question(form_nm=form_nm), gain, 30.0, sd**2, prints=1, pixels=1)
+
     # With no error of the form and a gain as large as the difference, the result is gain over noise.
-    assert surely_better(30.0, 30.0, 2.0, 0.0) == 15.0
+    assert z_of(30.0, 2.0, None) == z_of(30.0, 2.0, 0.0) == 15.0
     # An error of the form may account for 2 · √(30 · 1.2) = 12 of the gain.
-    assert surely_better(30.0, 30.0, 2.0, 1.2) == pytest.approx(9.0)
-    assert surely_better(30.0, 30.0, 2.0, 30.0) == 0.0
+    assert z_of(30.0, 2.0, 1.2) == pytest.approx(9.0)
+    assert z_of(30.0, 2.0, 30.0) == 0.0
     # Prints halfway between the rivals favour one of them only by noise, so the gain has to exceed half.
-    assert surely_better(14.0, 30.0, 0.1, 0.0) < Z_DECIDED < surely_better(16.0, 30.0, 0.1, 0.0)
+    assert z_of(14.0, 0.1, None) < Z_DECIDED < z_of(16.0, 0.1, None)
 
 
 def test_the_power_counts_the_form_as_the_decision_does() -> None:
-    pixels, difference_um, sd = 10_000, 0.005, 0.05
-    squares = pixels * difference_um**2
-    contrast = Contrast(*(torch.tensor([float(one)], dtype=torch.float64) for one in (squares, sd, pixels)))
+    pixels, difference_nm, sd = 10_000, 5.0, 5e4
+    squares = pixels * difference_nm**2
+    contrast = Contrast(*(torch.tensor([one], dtype=torch.float64) for one in (squares, sd)), pixels)
 
     def powers(form_nm: float | None) -> list[float]:
         question = slope_question(form_nm=form_nm)
@@ -737,11 +754,11 @@ def test_the_power_counts_the_form_as_the_decision_does() -> None:
 def test_a_question_below_the_models_own_error_is_declared_before_printing(
     rivalry: Rivalry, limits: Limits
 ) -> None:
-    prints = [PlannedPrint(as_tensor(first_layout(limits, 64)), TURNED)]
+    prints = [first_print(limits, 64)]
 
     def asked(form_nm: float | None) -> PlannedQuestion:
         question = slope_question(form_nm=form_nm)
-        own = Rivalry(question, base_model(), rivalry.printing, rivalry.noise)
+        own = Rivalry(question, base_model(), rivalry.noise)
         return of_rivals(own, {}, prints, prints, 4)
 
     plain = asked(None)
@@ -780,7 +797,7 @@ def test_two_names_of_one_model_end_in_one_optimum() -> None:
         return sum(float(one @ one) for one in TwinProblem(twin, windows).residuals(vector))
 
     alone = fit_least_squares(TwinProblem(twins[1], windows), start, RULES).vector
-    fits = fit_rivals(twins, windows)
+    fits = fit_rivals(dict(zip("ab", twins, strict=True)), windows).values()
     best, other = (squares(twin, fit.vector) for twin, fit in zip(twins, fits, strict=True))
     assert squares(twins[1], alone) > 1.02 * best
     # A fit ends when a step reduces the loss by less than 0.05 %.
@@ -799,7 +816,7 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
     for study in (scans, few):
         own = SimpleNamespace(windows=study, scans=scans, report=lambda message: None)
         asking = SimpleNamespace(study=own)
-        known += [np.trace(_Asking._rivals(cast(Any, asking), [name], [model(SLOPE)])[0].information)]
+        known += [np.trace(_Asking._rivals(cast(Any, asking), {name: model(SLOPE)})[0].information)]
     # An evenly drawn quarter of the pixels gives a quarter of the sum, which is then scaled up.
     assert known[1] == pytest.approx(known[0], rel=0.1)
 

@@ -15,16 +15,15 @@ from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
-from litho_models.effects.chain import EffectChain
+from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
 from litho_models.planning import layouts
-from litho_models.planning.layouts import SECOND_DOSE, as_tensor
-from litho_models.planning.rivalry import PlannedPrint, Printing, Way
+from litho_models.planning.layouts import SECOND_DOSE
+from litho_models.planning.rivalry import PLAIN, planned_scans, predict
 from litho_models.planning.run import next_print
-from tests.litho_models.loop_scans import base_model, blank_scans
-from tests.litho_models.test_next_print import closed_loop, slope_question
-
-PLAIN = (Way(),)
+from litho_models.scan_terms.grouped import ALL
+from tests.litho_models.loop_scans import blank_scans
+from tests.litho_models.test_next_print import SHARED, closed_loop, model, slope_question
 
 
 def _even_levels(size_px: int = 48) -> np.ndarray:
@@ -50,11 +49,10 @@ def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None
         scan_job(fab, Job("a", own, dose=dose)).height_um for own, dose in ((level, 0.5), (level // 2, 1.0))
     )
     assert np.abs(half_dose - half_levels).max() > 0.01
-    own = {"layer-stacking": {"share": 0.8, "threshold": 0.6, "steepness": 8.0}}
-    chain = EffectChain(torch.nn.Identity(), own)
-    wide = PlannedPrint(torch.full((40, 40), 12.0), PLAIN, dose=0.5)
-    with torch.no_grad():
-        middle = float(Printing(0.1, 0.1, 12).predict(chain, wide, Way())[20, 20])
+    own = {"share": 0.8, "threshold": 0.6, "steepness": 8.0}
+    twin = Twin.bare(torch.nn.Identity()).with_effect("layer-stacking", ALL, {"": own})
+    [wide] = planned_scans(SHARED, torch.full((40, 40), 12.0), [PLAIN], dose=0.5)
+    middle = float(predict(twin, wide)[20, 20])
     low, high, at = (1 / (1 + np.exp(-8 * (dose - 0.6))) for dose in (0.0, 1.0, 0.5))
     step = (at - low) / (high - low)
     # In the middle of a wide block, all twelve slices have half the dose (in float32).
@@ -62,12 +60,9 @@ def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None
 
 
 def test_plan_and_loop_see_a_dose_as_the_fab_does() -> None:
-    chain = EffectChain(base_model(), {})
-    printing = Printing(0.1, 0.1, 12)
-    level = as_tensor(_even_levels())
-    with torch.no_grad():
-        at_half = printing.predict(chain, PlannedPrint(level, PLAIN, dose=0.5), Way())
-        half = printing.predict(chain, PlannedPrint(level / 2, PLAIN), Way())
+    level = _even_levels()
+    scans = planned_scans(SHARED, level, [PLAIN], dose=0.5) + planned_scans(SHARED, level // 2, [PLAIN])
+    at_half, half = (predict(model({}), scan) for scan in scans)
     assert torch.allclose(at_half, half, atol=1e-6)
     scan = blank_scans(1)[0]
     usual, weak, untold = (prepare_scans([replace(scan, dose=dose)])[0] for dose in (1.0, 0.8, None))
@@ -84,9 +79,9 @@ def test_a_plan_takes_a_second_dose_where_it_separates(
     plain = layouts.score
     asked: list[tuple[float, ...]] = []
 
-    def score(rivalry, level, ways, place="centre", doses=(1.0,), known=None):
-        asked.append(tuple(doses))
-        return plain(rivalry, level, ways, place) * (gain if SECOND_DOSE in doses else 1.0)
+    def score(rivalry, prints):
+        asked.append(tuple(scans[0].dose for scans in prints))
+        return plain(rivalry, prints[:1]) * (gain if SECOND_DOSE in asked[-1] else 1.0)
 
     monkeypatch.setattr(layouts, "score", score)
     plan = next_print(loop, tmp_path / "plan", prints=2, field_um=6.4, steps=0, layouts="random")
