@@ -30,8 +30,6 @@ ENOUGH = 0.95
 # If the power does not exceed this value, the planned prints count as unable to separate the rivals, unless a
 # larger number of prints is enough.
 HOPELESS = 0.2
-# Largest number of prints for which the power is computed.
-MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
@@ -59,11 +57,9 @@ def of_repeats(prints: int, scans: int) -> float:
     """
     if prints < 2 or scans < 2:
         return 0.0
-    between, within = prints - 1, prints * (scans - 1)
+    law = f_distribution(prints - 1, prints * (scans - 1))
     ratio = 1 + scans * PRINT_SHARE / (1 - PRINT_SHARE)
-    printer = f_distribution.sf(f_distribution.isf(CONFIRM_P, between, within) / ratio, between, within)
-    scanned = f_distribution.cdf(ratio * f_distribution.ppf(CONFIRM_P, between, within), between, within)
-    return float(min(printer, scanned))
+    return float(min(law.sf(law.isf(CONFIRM_P) / ratio), law.cdf(ratio * law.ppf(CONFIRM_P))))
 
 
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
@@ -118,7 +114,8 @@ def surely_better(
     return max(gain - max(unknown, seen), 0.0) / sd
 
 
-_COUNTS = range(1, MOST_PRINTS + 1)
+# Numbers of prints for which the power is computed.
+_COUNTS = range(1, 13)
 # Number of times that the parameters of the rivals are drawn at random within their uncertainty. The power is
 # averaged over these draws, because the difference between two rivals may depend on the parameters.
 DRAWS = 8
@@ -264,9 +261,8 @@ def _planned(
     elif powers[prints - 1] <= HOPELESS and max(powers) < ENOUGH:
         status = "no experiment separates"
         if question.rivals:
-            why.append(
-                f"no experiment of this plan separates them, but another one might: {question.experiment}"
-            )
+            another = question.experiment
+            why = [*why, f"no experiment of this plan separates them, but another one might: {another}"]
     return PlannedQuestion(
         **question.model_dump(include={"name", "kind", "text", "form_nm"}),
         status=status,

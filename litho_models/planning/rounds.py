@@ -231,9 +231,9 @@ def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Dec
     is named as the cause. The role of this effect is ``process`` if the answer states that the printer causes
     it, ``measurement`` if the answer states the microscope, and otherwise the role in the catalogue.
     """
-    questions = {one.name: one for one in open_.questions}
+    rivals_of = {one.name: one.rivals for one in open_.questions}
     for decision in decisions:
-        name, rivals = decision.question, questions[decision.question].rivals
+        name, rivals = decision.question, rivals_of[decision.question]
         left = [one for one in rivals if one.name in decision.left]
         cause = next((one for one in closed.traced if one.name == name), None)
         if not left or decision.verdict == NONE or (cause is None and len(left) > 1):
