@@ -65,16 +65,16 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     have two or more scans. If two groupings divide the scans in the same way, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
-    names = [ALL, *stated, "print", *_STATED]
+    names = [*stated, "print", *_STATED]
     if len({len(scan.id) for scan in scans}) == 1:
         names += [f"{_CHARACTER} {at}" for at in range(1, len(scans[0].id) + 1)]
-    found: dict[str, Labels] = {}
+    found: dict[str, Labels] = {ALL: ("",) * len(scans)}
     for name in names:
         labels = tuple(label_of(scan, name) for scan in scans)
-        if name == ALL or (_is_grouped(labels) and not _is_known(labels, found)):
+        if _is_grouped(labels) and not _is_known(labels, found):
             found[name] = labels
     if by_order:
-        for first in _places(scans, found.get("print")):
+        for first in _places(scans, "print" in found):
             last = max(scan.order for scan in scans if scan.order < first)
             name = f"{_ORDER} {last}-{first}"
             labels = tuple(label_of(scan, name) for scan in scans)
@@ -97,21 +97,19 @@ def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
     )
 
 
-def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
+def _places(scans: Sequence[PrintedScan], by_print: bool) -> list[int]:
     """Return the positions in the printing order at which something may have changed. If it is known which
     scan belongs to which print, these are the positions between prints. Otherwise, they are all positions
     with at least two scans before and two scans after them.
     """
-    orders = sorted({scan.order for scan in scans})
-    if prints is not None:
-        first = {
-            label: min(s.order for s, own in zip(scans, prints, strict=True) if own == label)
-            for label in prints
-        }
-        return [order for order in sorted(set(first.values())) if order > orders[0]]
-    return orders[FEWEST_IN_GROUP : len(orders) - FEWEST_IN_GROUP + 1]
+    if by_print:
+        prints = {scan.print_id for scan in scans}
+        return sorted({min(s.order for s in scans if s.print_id == own) for own in prints})[1:]
+    return sorted({scan.order for scan in scans})[FEWEST_IN_GROUP : 1 - FEWEST_IN_GROUP]
 
 
+# Strengths of a block's columns, keyed by the label of a group.
+Strengths = dict[str, np.ndarray]
 # A small number that is added to the unit diagonal of the scaled normal equations, so that they can be solved
 # even if columns are equal.
 _ALIKE = 1e-7
@@ -152,18 +150,17 @@ class Products:
         """Make products for scans without groups. Every column then has a single strength for all scans."""
         return cls(grams, {ALL: ("",) * len(grams)})
 
-    def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
+    def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[Strengths]:
         """Fit the strengths to the scans with the given indices, and return them. The result is a list with
         one dictionary per block. Each dictionary maps a label to an array of strengths, of shape (columns,).
 
         Labels that do not occur among these scans are absent from the dictionaries.
         """
-        expanded = _Expanded(self, blocks, scans)
-        solved = expanded.solve([0])[:, 0]
-        return [{label: solved[rows] for label, rows in own.items()} for own in expanded.rows]
+        solved = self._solved(blocks, scans, [0])
+        return [{label: own[:, 0] for label, own in known.items()} for known in solved]
 
     def squares(
-        self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
+        self, blocks: Sequence[Block], strengths: Sequence[Strengths], scans: np.ndarray
     ) -> np.ndarray:
         """Return the mean squared residual of each scan with the given indices, after the columns of the
         blocks have been subtracted. Before the subtraction, each column is multiplied by its strength in the
@@ -171,16 +168,9 @@ class Products:
 
         If a block has no strengths for the label of a scan, the block is not subtracted from this scan.
         """
-        left = np.empty(len(scans))
-        for number, scan in enumerate(scans):
-            vector = np.zeros(self.grams.shape[1])
-            vector[0] = 1.0
-            for block, known in zip(blocks, strengths, strict=True):
-                own = known.get(self.groups[block.by][scan])
-                if own is not None:
-                    vector[list(block.columns)] -= own
-            left[number] = vector @ self.grams[scan] @ vector
-        return left
+        residual = np.eye(1, self.grams.shape[1])[0]
+        rests = (self._rest(residual, blocks, strengths, scan) for scan in scans)
+        return np.array([rest @ self.grams[scan] @ rest for rest, scan in zip(rests, scans, strict=True)])
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
         """Return the cross-validated mean squared residual of each scan. For each scan, the strengths are
@@ -204,66 +194,57 @@ class Products:
         later fit of these columns gives the same result as a joint fit with the blocks. If these strengths
         differ by group, the two results agree only if the subtracted part is the same in all groups.
         """
-        every = np.arange(len(self.grams))
-        expanded = _Expanded(self, blocks, every)
-        used = {column for block in blocks for column in block.columns}
-        rest = np.array([c for c in range(self.grams.shape[1]) if c not in used], np.intp)
-        solved = expanded.solve(rest)
+        whole = np.eye(self.grams.shape[1])
+        solved = self._solved(blocks, np.arange(len(self.grams)), range(len(whole)))
         freed = np.empty_like(self.grams)
-        for members, rows in expanded.alike:
-            change = np.zeros(self.grams.shape[1:])
-            change[rest, rest] = 1.0
-            # Columns that occur in several blocks count once for each block.
-            np.subtract.at(change, np.ix_(expanded.columns, rest), solved[rows])
-            freed[members] = change.T @ self.grams[members] @ change
+        for scan in range(len(freed)):
+            rest = self._rest(whole, blocks, solved, scan)
+            rest[:, [column for block in blocks for column in block.columns]] = 0
+            freed[scan] = rest.T @ self.grams[scan] @ rest
         return Products(freed, self.groups)
 
-
-class _Expanded:
-    """The normal equations of a regression in which strengths differ by group. There is one unknown, and
-    therefore one row, for every combination of a column and a label.
-
-    Attributes:
-        columns: indices of the columns of all blocks.
-        rows: for each block and label, the row numbers of its strengths.
-        alike: one pair for each set of scans that have the same labels in the groupings of all blocks. The
-            pair contains the indices of these scans, and the row numbers of their strengths in the order of
-            ``columns``.
-    """
-
-    def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
-        self._grams = products.grams
-        self.columns = np.array([c for block in blocks for c in block.columns], np.intp)
-        by: dict[tuple[str, ...], list[int]] = {}
-        for scan in scans:
-            by.setdefault(tuple(products.groups[block.by][scan] for block in blocks), []).append(int(scan))
-        usual = np.einsum("sii->si", self._grams)[scans].sum(axis=0) / max(len(scans), 1)
-        self.rows: list[dict[str, np.ndarray]] = [{} for _ in blocks]
-        self._shrunk = np.empty(0)
-        for number, (own, block) in enumerate(zip(self.rows, blocks, strict=True)):
-            for label in sorted({labels[number] for labels in by}):
-                own[label] = len(self._shrunk) + np.arange(len(block.columns))
-                self._shrunk = np.append(self._shrunk, block.shrinking * usual[list(block.columns)])
-        self.alike = []
-        for labels, members in by.items():
-            rows = [own[label] for own, label in zip(self.rows, labels, strict=True)]
-            self.alike.append((members, np.concatenate([np.empty(0, int), *rows])))
-
-    def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Return the strengths that fit each target best in the sense of least squares. A target is the index
-        of a column, or 0 for the residual. The result has shape (rows, targets).
+    def _rest(
+        self, start: np.ndarray, blocks: Sequence[Block], strengths: Sequence[Strengths], scan: int
+    ) -> np.ndarray:
+        """Subtract the columns of the blocks, times their strengths in one scan, from a combination of the
+        residual and the columns. The combination ``start`` and the result have shape (1 + m,), or (1 + m,
+        targets) for several combinations.
         """
-        size, wanted = len(self._shrunk), np.array(targets, np.intp)
-        matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
-        for members, rows in self.alike:
+        rest = start.copy()
+        for block, known in zip(blocks, strengths, strict=True):
+            own = known.get(self.groups[block.by][scan])
+            if own is not None:
+                rest[list(block.columns)] -= own
+        return rest
+
+    def _solved(self, blocks: Sequence[Block], scans: np.ndarray, targets: Sequence[int]) -> list[Strengths]:
+        """Solve the normal equations, and return the strengths that fit each target best in the sense of
+        least squares, in the form of ``strengths``. A target is the index of a column, or 0 for the residual.
+        Each array of strengths has shape (columns, targets).
+
+        There is one unknown, and therefore one row, for every combination of a column and a label.
+        """
+        if not blocks:
+            return []
+        alike: dict[Labels, list[int]] = {}
+        for scan in scans:
+            alike.setdefault(tuple(self.groups[block.by][scan] for block in blocks), []).append(scan)
+        usual = np.einsum("sii->si", self.grams)[scans].sum(axis=0) / max(len(scans), 1)
+        rows: list[Strengths] = [{} for _ in blocks]
+        shrunk: list[float] = []
+        for number, (own, block) in enumerate(zip(rows, blocks, strict=True)):
+            for label in sorted({labels[number] for labels in alike}):
+                own[label] = len(shrunk) + np.arange(len(block.columns))
+                shrunk += [block.shrinking * usual[column] for column in block.columns]
+        columns = [column for block in blocks for column in block.columns]
+        matrix, right = np.diag(shrunk), np.zeros((len(shrunk), len(targets)))
+        for labels, members in alike.items():
+            at = np.concatenate([own[label] for own, label in zip(rows, labels, strict=True)])
             # To take rows and then columns is several times as fast as ``np.ix_``.
-            gram = self._grams[members].sum(axis=0).take(self.columns, axis=0)
-            one, other = gram.take(self.columns, axis=1), gram.take(wanted, axis=1)
-            if len(self.alike) == 1:
-                matrix, right = matrix + one, right + other
-            else:
-                matrix[np.ix_(rows, rows)] += one
-                right[rows] += other
+            gram = self.grams[members].sum(axis=0).take(columns, axis=0)
+            matrix[np.ix_(at, at)] += gram.take(columns, axis=1)
+            right[at] += gram.take(targets, axis=1)
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
-        normal = matrix / (scale * scale.T) + _ALIKE * np.eye(size)
-        return np.linalg.solve(normal, right / scale) / scale
+        normal = matrix / (scale * scale.T) + _ALIKE * np.eye(len(scale))
+        solved = np.linalg.solve(normal, right / scale) / scale
+        return [{label: solved[at] for label, at in own.items()} for own in rows]
