@@ -64,7 +64,7 @@ class Cell(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
+def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, ...]:
     """Divide the scan into a checkerboard of square blocks, and return the masks for each of its two colours.
 
     Raises:
@@ -76,12 +76,11 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
     if block_px <= 2 * buffer_px:
         raise InputError("block_px", got=block_px, wanted=f"more than twice the buffer of {buffer_px} px")
     shift = np.random.default_rng(blocks.seed).integers(0, 2 * block_px, size=2)
-    row, column = ((np.arange(n) + s) // block_px for n, s in zip(shape, shift, strict=True))
-    first = (row[:, None] + column[None, :]) % 2 == 0
-    inner, outer = (
-        minimum_filter(part, size=2 * buffer_px + 1, mode="constant", cval=1) for part in (first, ~first)
+    first = ((np.indices(shape) + shift[:, None, None]) // block_px).sum(axis=0) % 2 == 0
+    return tuple(
+        Half(minimum_filter(part, size=2 * buffer_px + 1, mode="constant", cval=1), ~part)
+        for part in (first, ~first)
     )
-    return Half(calibrate=inner, score=~first), Half(calibrate=outer, score=first)
 
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:

@@ -69,7 +69,6 @@ def cross_fit(
             valid pixel, or the scan is too small for the terms.
     """
     blocks = blocks or Blocks()
-    chosen_terms(terms)
     height, prediction = np.asarray(height_um, np.float64), np.asarray(prediction_um, np.float64)
     if not height.shape == prediction.shape == valid.shape:
         shapes = f"height {height.shape}, prediction {prediction.shape}, valid {valid.shape}"
@@ -84,7 +83,7 @@ def cross_fit(
     difference = np.where(usable, height - prediction, 0.0)
     residual = np.full(height.shape, np.nan)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
-    lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines is not None]
+    lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines]
     axes = [axis_along(line) for line in lines]
     cells = line_cells(height.shape, axes, blocks.line_gap_px)
     freedom = []
@@ -117,7 +116,7 @@ def fitted_terms(
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)
-    coefficients = least_squares(basis[:, used], target) if len(basis) else np.zeros(0)
+    coefficients = least_squares(basis[:, used], target)
     return coefficients, np.tensordot(coefficients, basis, axes=1)
 
 
@@ -137,10 +136,8 @@ def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
 
 
 def _fitted(basis: FloatMap, difference: FloatMap, calibrate: BoolMap) -> FloatMap:
-    if not len(basis):
-        return np.zeros_like(difference)
     design = basis[:, calibrate]
-    if design.shape[1] <= 2 * len(basis):
+    if len(basis) and design.shape[1] <= 2 * len(basis):
         raise InputError(
             "too few calibration pixels for the scan terms",
             got=f"{design.shape[1]} pixels for {len(basis)} terms",

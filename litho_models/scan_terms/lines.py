@@ -26,7 +26,7 @@ def scan_line_index(
         pitch_um: size of a layout pixel. The distance between scan lines is assumed to equal this size.
         bend_um: bend of the scan, which ``scan_to_layout`` does not contain; None if the scan is not bent.
     """
-    y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
+    y, x = (np.indices(shape) + 0.5) * pitch_um
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
     scan_x, scan_y, depth = (row[0] * x + row[1] * y + row[2] for row in inverse)
     scan_x, scan_y = scan_x / depth, scan_y / depth
@@ -43,7 +43,7 @@ def axis_along(line: LineIndex) -> int:
     Lines along y occur in scans that are rotated by 90 degrees.
     """
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
-    return 1 if down >= across else 0
+    return int(down >= across)
 
 
 def shrunk_line_offsets(
@@ -68,14 +68,13 @@ def shrunk_line_offsets(
         A tuple of three items: the offsets in µm, of shape (lines,); the shrinkage weight of each offset,
         from 0 to 1, of shape (lines,); and the variance v in µm².
     """
-    line_count = int(line.max()) + 1
-    axis = axis_along(line)
-    along = np.arange(residual_um.shape[axis]) // block_px
-    block = np.broadcast_to(np.expand_dims(along, 1 - axis), residual_um.shape)
-    block_count = int(block.max()) + 1
+    block = np.indices(line.shape)[axis_along(line)] // block_px
+    line_count, block_count = int(line.max()) + 1, int(block.max()) + 1
     cell = (line * block_count + block)[used]
-    count = np.bincount(cell, minlength=line_count * block_count).reshape(line_count, block_count)
-    total = np.bincount(cell, residual_um[used], minlength=count.size).reshape(count.shape)
+    count, total = (
+        np.bincount(cell, weights, line_count * block_count).reshape(line_count, block_count)
+        for weights in (None, residual_um[used])
+    )
     # Blocks with few pixels (at the edge of the scan) are left out, because all blocks have equal weight.
     filled = count >= max(1, count.max() // 2)
     means = np.where(filled, total / np.maximum(count, 1), 0.0)

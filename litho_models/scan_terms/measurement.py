@@ -28,6 +28,7 @@ from litho_models.scan_terms.term import FloatMap
 
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
+_SHIFTS = ("shift-y", "shift-x")
 
 # Surfaces that the microscope software may have fitted to whole scan files and subtracted from them. Each
 # surface is given by the numbers of its terms in the list of polynomials x, y, x², xy, y², counted from 1.
@@ -158,14 +159,13 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
     result have shape (ny, nx) and are in µm.
     """
     prediction = np.asarray(prediction_um, np.float64)
-    moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
+    moves = [part for part in parts if part.what in _SHIFTS]
     if not moves:
         return prediction
-    y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in scan.shape), indexing="ij")
-    places = {"shift-y": y, "shift-x": x}
+    places = np.indices(scan.shape, np.float64)
     for part in moves:
-        places[part.what] += part.map_um(scan) / scan.pitch_um
-    return map_coordinates(prediction, [*places.values()], order=3, mode="nearest")
+        places[_SHIFTS.index(part.what)] += part.map_um(scan) / scan.pitch_um
+    return map_coordinates(prediction, places, order=3, mode="nearest")
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:

@@ -87,26 +87,16 @@ def learn_measurement(
         return model
     levelling = like.levelling if like else _best_levelling(pairs)
     model = model.model_copy(update={"levelling": levelling, "scans": len(pairs)})
-    chosen = like.parts if like else []
+    groups = groupings([scan for scan, _ in pairs], by_order=False)
+    chosen = like.parts if like else None
     for _ in range(_ROUNDS):
-        products = _products(pairs, model)
-        if not (chosen or like):
+        products = Products(np.stack([_gram(*pair, model) for pair in pairs]), groups)
+        if chosen is None:
             chosen = _chosen(products, _deal([scan.id for scan, _ in pairs], seed))
         model = model.model_copy(update={"parts": _fitted(products, chosen)})
         if not chosen:
             break
     return model
-
-
-def _products(pairs: Sequence[Pair], model: MeasurementModel) -> Products:
-    """Return, for each scan, the inner products between the residual and the columns (regressors) of all
-    parts that may be tried. The columns are computed by linearisation at the current measurement model.
-    """
-    grams = []
-    for scan, prediction in pairs:
-        rows = _rows(scan, prediction, model)
-        grams.append(rows @ rows.T / rows.shape[1])
-    return Products(np.stack(grams), groupings([scan for scan, _ in pairs], by_order=False))
 
 
 def _chosen(products: Products, fold_of: np.ndarray) -> list[SharedPart]:
@@ -149,10 +139,13 @@ def _fitted(products: Products, chosen: Sequence[SharedPart]) -> list[SharedPart
     ]
 
 
-def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """Return an array whose first row is the residual of a scan. The other rows are the m columns
-    (regressors) of all parts that may be tried. The values are taken at a thinned set of n pixels, and the
-    mean of each row is subtracted. The result has shape (1 + m, n).
+def _gram(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
+    """Return the inner products, divided by the number of pixels, between the residual of a scan and the m
+    columns (regressors) of all parts that may be tried. Index 0 stands for the residual. The result has shape
+    (1 + m, 1 + m).
+
+    The values are taken at a thinned set of pixels, and the mean of the residual and of each column is
+    subtracted. The columns are computed by linearisation at the current measurement model.
 
     The contribution of the parts that are already in ``model`` is added back to the residual, to first order.
     Each round therefore fits the full coefficients and not corrections to them. As a result, the prior
@@ -161,25 +154,23 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
     slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
-    count, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
-    rows = np.empty((count + 2 * lateral + 1, len(at)))
-    np.take(polynomials(scan.shape, _HIGHEST).reshape(count, -1), at, 1, out=rows[:count], mode="clip")
+    shapes = polynomials(scan.shape, _HIGHEST).reshape(polynomial_count(_HIGHEST), -1).take(at, axis=1)
+    lateral = shapes[: polynomial_count(_LATERAL)]
+    moved = np.stack([*lateral * slope_x, *lateral * slope_y, seen.reshape(-1)[at]])
     # The background is added after levelling, so the columns of the background are not levelled.
-    surface, moved = rows[[0, *LEVELLED[model.levelling]]], rows[count:]
-    np.multiply(rows[:lateral], slope_x, out=moved[:lateral])
-    np.multiply(rows[:lateral], slope_y, out=moved[lateral:-1])
-    moved[-1] = seen.reshape(-1)[at]
+    surface = shapes[[0, *LEVELLED[model.levelling]]]
     moved -= least_squares(surface, moved.T).T @ surface
-    rows[0] = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
+    residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
+    rows = np.stack([residual, *shapes[1:], *moved])
     for part in model.parts:
         if known := part.of(scan):
             rows[0] += known @ rows[list(_block(part).columns)]
     rows -= rows.mean(axis=1, keepdims=True)
-    return rows
+    return rows @ rows.T / rows.shape[1]
 
 
 def _block(part: SharedPart) -> Block:
-    """Return the block of a part: its columns in the result of ``_rows``, its grouping and its prior."""
+    """Return the block of a part: its columns in the result of ``_gram``, its grouping and its prior."""
     surface, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     starts = {
         "background": 1,

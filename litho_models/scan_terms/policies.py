@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import unknown_name
+from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.blocks import Blocks
@@ -29,16 +29,14 @@ POLICIES: dict[Policy, Terms] = {
 }
 
 
-def policy_terms(policy: str) -> Terms:
+def policy_terms(policy: Policy) -> Terms:
     """Return the scan terms of a policy, i.e. of a named set of terms that are fitted to each scan.
 
     Raises:
         InputError: there is no policy with this name.
     """
-    for known, terms in POLICIES.items():
-        if policy == known:
-            return terms
-    raise unknown_name("nuisance policy", policy, POLICIES)
+    require_known("nuisance policy", policy, POLICIES)
+    return POLICIES[policy]
 
 
 def usual_policy(film: bool) -> Policy:

@@ -8,14 +8,14 @@ loop that corrects a model (``litho_models.loop``). ``register_scan_term`` adds 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 
 FloatMap = NDArray[np.float64]
 LineIndex = NDArray[np.intp]
@@ -45,18 +45,14 @@ class TermPixels:
         return self._taken(prediction) - float(prediction.mean())
 
     @cached_property
-    def slopes(self) -> tuple[FloatMap, FloatMap]:
-        """Return the change of the predicted height per pixel along y and along x, µm, at the n pixels. Each
-        of the two arrays has shape (n,).
-        """
-        slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
-        return self._taken(slopes[0]), self._taken(slopes[1])
+    def slopes(self) -> FloatMap:
+        """Return the change of the predicted height per pixel along y and along x, µm, of shape (2, n)."""
+        return self._taken(np.array(np.gradient(np.asarray(self.prediction_um, np.float64))))
 
     @cached_property
     def smooth(self) -> FloatMap:
         """Return the five maps of ``smooth_shapes`` at the pixels, of shape (5, n)."""
-        shapes = smooth_shapes(self.prediction_um.shape)
-        return np.stack([self._taken(shape) for shape in shapes])
+        return self._taken(smooth_shapes(self.prediction_um.shape))
 
     @cached_property
     def time(self) -> FloatMap:
@@ -66,9 +62,9 @@ class TermPixels:
         line = row_index(self.prediction_um.shape) if self.line is None else self.line
         return self._taken(line) / max(int(line.max()), 1)
 
-    def _taken(self, field: NDArray[Any]) -> FloatMap:
-        flat = field.reshape(-1)
-        return flat if self.at is None else flat[self.at]
+    def _taken(self, maps: NDArray[Any]) -> FloatMap:
+        flat = maps.reshape(*maps.shape[:-2], -1)
+        return flat if self.at is None else flat.take(self.at, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -129,8 +125,8 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
         InputError: a name is not in the catalogue.
     """
     wanted = set(names)
-    for name in sorted(wanted - SCAN_TERMS.keys()):
-        raise unknown_name("scan term", name, SCAN_TERMS)
+    for name in sorted(wanted):
+        require_known("scan term", name, SCAN_TERMS)
     return [term for name, term in SCAN_TERMS.items() if name in wanted]
 
 
@@ -180,9 +176,8 @@ def row_index(shape: tuple[int, ...]) -> LineIndex:
 
 def _drift(pixels: TermPixels) -> FloatMap:
     """Return one map for each decay time. It shows an exponential creep that starts with the scan."""
-    time = pixels.time
-    ends = TermPixels(pixels.prediction_um, pixels.line).time if pixels.at is not None else time
-    return np.stack([np.exp(-time / d) - np.exp(-ends / d).mean() for d in CREEP_DECAYS.values()])
+    whole = replace(pixels, at=None).time
+    return np.stack([np.exp(-pixels.time / d) - np.exp(-whole / d).mean() for d in CREEP_DECAYS.values()])
 
 
 def _warp(pixels: TermPixels) -> FloatMap:
