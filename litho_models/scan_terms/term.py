@@ -101,8 +101,7 @@ def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
     result has shape (k, n).
     """
     chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
-    count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
-    return np.concatenate([np.empty((0, count)), *chosen])
+    return np.concatenate([np.empty((0, len(pixels.height))), *chosen])
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:
@@ -171,7 +170,7 @@ def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
 
 def row_index(shape: tuple[int, ...]) -> LineIndex:
     """Return the row number of each pixel, as an array of shape (ny, nx)."""
-    return np.broadcast_to(np.arange(shape[0], dtype=np.intp)[:, None], shape)
+    return np.indices(shape, np.intp)[0]
 
 
 def _drift(pixels: TermPixels) -> FloatMap:
