@@ -37,11 +37,11 @@ class EffectChain(nn.Module):
         self,
         base: nn.Module,
         effects: Mapping[str, Mapping[str, float]],
-        frames: Mapping[str, Frame] | None = None,
+        frames: Mapping[str, Frame] = {},
     ):
         super().__init__()
         self.base = base
-        self.frames = frames or {}
+        self.frames = frames
         self.values = {
             name: get_effect(name).with_values(effects[name]) for name in in_forward_order(effects)
         }

@@ -5,8 +5,8 @@ of its amplitudes has its null value.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import product
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_models.effects.filters import add_blur, local_mean, pixel_numbers
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
@@ -28,6 +29,9 @@ Values = Mapping[str, Tensor]
 # Tolerance for values that lie on a bound, as a fraction of the range. The tolerance is needed because a
 # value is rounded when it is stored in float32.
 _ROUNDING = 1e-6
+
+# Variance of the spot that exposes single slices, and the distance from its centre at which it is cut off.
+_SLICED_VARIANCE_UM2, _SLICED_REACH_UM = 0.02, 0.8
 
 
 @dataclass(frozen=True)
@@ -104,15 +108,24 @@ class FieldContext:
     new_tip: bool = False
     pixel_size: float = 1.0
     dose: float = 1.0
-    _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Return the quantity ``name``, which depends only on this field. The first call computes it with the
-        function ``make``; later calls return the cached result.
+    @cached_property
+    def exposed_slices(self) -> Tensor:
+        """Return the exposure of each slice, blurred by the spot, where 1 means fully exposed. The result has
+        shape (slices, 1, ny, nx).
         """
-        if name not in self._kept:
-            self._kept[name] = make(self)
-        return self._kept[name]
+        count = max(1, round(self.full_height_um / self.slice_um))
+        # The dose changes the exposure, not the number of slices.
+        number = (self.layout_um / (self.dose * self.slice_um))[0]
+        lower = torch.arange(count).to(number)[:, None, None, None]
+        slices = self.dose * torch.clamp(number - lower, 0, 1)
+        return add_blur(slices, _SLICED_VARIANCE_UM2, self.pitch_um, _SLICED_REACH_UM)
+
+    def dose_nearby(self, length_um: Tensor) -> Tensor:
+        """Return the mean nominal height around each pixel, as a fraction of the full height. The mean has
+        Gaussian weights with standard deviation ``length_um``. The result has shape (1, 1, ny, nx).
+        """
+        return local_mean(self.layout_um / self.full_height_um, length_um, self.pitch_um)
 
     def in_scan_frame(self) -> FieldContext:
         """Return this context rotated into the frame of the scan, in which the fast axis runs along x."""
@@ -134,7 +147,7 @@ class FieldContext:
         """Return the y and x positions of the pixels relative to the centre of the write field, µm. The two
         tensors have shapes (ny, 1) and (1, nx).
         """
-        rows, columns = self._pixels()
+        rows, columns = pixel_numbers(self.layout_um)
         (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
         return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
 
@@ -146,15 +159,9 @@ class FieldContext:
         """Return the y and x positions of the pixels relative to the whole scan. Each coordinate runs from -1
         to 1 over the whole scan. The two tensors have shapes (ny, 1) and (1, nx).
         """
-        rows, columns = self._pixels()
+        rows, columns = pixel_numbers(self.layout_um)
         (ny, nx), (top, left) = self.whole_shape(), self.origin_px
         return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
-
-    def _pixels(self) -> tuple[Tensor, Tensor]:
-        """Return the row numbers and the column numbers of the pixels, of shapes (ny, 1) and (1, nx)."""
-        layout = self.layout_um
-        y, x = (torch.arange(n, dtype=layout.dtype, device=layout.device) for n in layout.shape[-2:])
-        return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
         """Return half the width of the write field, µm. If the dataset card (the TOML file that describes a
@@ -227,15 +234,17 @@ class Effect:
     of_tip: bool = False
     of_films: bool = False
     knowledge: Knowledge = "cause"
-    amplitudes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        amplitudes = tuple(name for name, p in self.parameters.items() if p.kind == "amplitude")
-        if not amplitudes:
+        if not self.amplitudes:
             raise InputError(f"effect {self.name}", got="no amplitude", wanted="at least one")
-        object.__setattr__(self, "amplitudes", amplitudes)
         if not (self.trials or self.per_scan):
             object.__setattr__(self, "trials", tuple(self._trials()))
+
+    @cached_property
+    def amplitudes(self) -> tuple[str, ...]:
+        """Return the names of the parameters that are amplitudes."""
+        return tuple(name for name, p in self.parameters.items() if p.kind == "amplitude")
 
     @property
     def per_scan(self) -> bool:
@@ -250,10 +259,6 @@ class Effect:
                 for value in facts.tried or (facts.typical,):
                     yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
-    def off_values(self) -> dict[str, float]:
-        """Return the values that the parameters have while the effect is switched off."""
-        return {name: parameter.off for name, parameter in self.parameters.items()}
-
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return the values of all parameters. A parameter that is not in ``values`` is set to its value
         ``Parameter.off``.
@@ -263,7 +268,7 @@ class Effect:
         """
         for name in values:
             require_known(f"parameter of {self.name}", name, self.parameters)
-        return {**self.off_values(), **values}
+        return {**{name: parameter.off for name, parameter in self.parameters.items()}, **values}
 
     def require_in_range(self, values: Mapping[str, float]) -> None:
         """Check that all values are within their physical ranges.
@@ -297,7 +302,7 @@ class Effect:
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
-            for name, value in {**self.off_values(), **values}.items()
+            for name, value in {**self.with_values({}), **values}.items()
         }
         if not scanned:
             return self.apply(array, tensors, context)
@@ -310,15 +315,7 @@ class Effect:
         return torch.rot90(seen, -turn, (-2, -1))
 
 
-def entry(
-    title: str,
-    parameters: Mapping[str, Parameter],
-    *,
-    stage: Stage,
-    role: Role,
-    acts_on: ActsOn,
-    **facts: Any,
-) -> Callable[[Apply], Effect]:
+def entry(title: str, parameters: Mapping[str, Parameter], **facts: Any) -> Callable[[Apply], Effect]:
     """Make a decorator that turns a formula (a function of the type ``Apply``) into an effect. The effect
     gets the name of the function, with hyphens instead of underscores. ``facts`` sets the other fields of
     ``Effect``.
@@ -326,10 +323,15 @@ def entry(
 
     def of_formula(apply: Apply) -> Effect:
         name = apply.__name__.replace("_", "-")
-        return Effect(name, title, stage, role, acts_on, parameters, apply, **facts)
+        return Effect(name=name, title=title, parameters=parameters, apply=apply, **facts)
 
     return of_formula
 
+
+# Parameter sets that screening tries for an effect with one amplitude along each axis.
+ALONG_AXES = ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
+# The direction of writing or scanning along an axis: 1 forwards, -1 backwards.
+DIRECTION = Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0))
 
 # Decorators for the usual stages and roles of effects.
 of_exposure = partial(entry, stage="exposure", role="process", acts_on="layout")

@@ -10,17 +10,14 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
-from litho_models.effects.filters import add_blur, add_filtered
+from litho_models.effects.filters import add_filtered, add_scattered
+from litho_models.models.parts import project
 
 # If the variances of the spot along its two axes differ by less than about this value, the spot is narrowed
 # along one axis by as much as it is widened along the other. If the variances differ by more, the excess only
 # widens the spot along one axis, so that high frequencies are not amplified further.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
-
-# Variance of the spot that cures the slices, and the distance from its centre at which it is cut off.
-_SLICED_VARIANCE_UM2 = 0.02
-_SLICED_REACH_UM = 0.8
 
 
 @of_exposure(
@@ -41,7 +38,7 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-        moment = isotropic * (fx * fx + fy * fy) + stretch * (fx * fx - fy * fy) + 2 * shear * fx * fy
+        moment = (isotropic + stretch) * fx * fx + (isotropic - stretch) * fy * fy + 2 * shear * fx * fy
         return torch.expm1(-(math.pi**2) * moment)
 
     return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM)
@@ -57,12 +54,8 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that leaks in from the neighbourhood of each pixel: D = (M + η G_b * M) / (1 + η), where η
-    is the weight of this dose and G_b is a Gaussian of standard deviation b.
-    """
-    weight, length = values["weight"], values["length_um"]
-    blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
-    return layout + weight / (1 + weight) * (blurred - layout)
+    """Add the dose that leaks in from the neighbourhood of each pixel; see ``add_scattered``."""
+    return add_scattered(layout, values["weight"], values["length_um"], context.pitch_um)
 
 
 @of_exposure(
@@ -101,24 +94,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
     spot is lost, and a gap that is narrower than the spot is filled.
     """
-    exposed = context.kept("slices", _exposed_slices)
-    gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
+    # A logistic function is a hyperbolic tangent of half the steepness.
+    exposed = context.exposed_slices
+    gained = project(exposed, values["steepness"] / 2, values["threshold"]) - exposed
     return height + values["share"] * context.slice_um * gained.sum(dim=0, keepdim=True)
-
-
-def _exposed_slices(context: FieldContext) -> Tensor:
-    """Return the exposure of each slice, blurred by the spot, where 1 means fully exposed. The result has
-    shape (slices, 1, ny, nx).
-    """
-    layout = context.layout_um
-    count = max(1, round(context.full_height_um / context.slice_um))
-    # The dose changes the exposure, not the number of slices.
-    number = layout / (context.dose * context.slice_um)
-    slices = context.dose * torch.clamp(number - torch.arange(count).to(layout)[:, None, None], 0, 1)
-    slices = slices.reshape(count, 1, *layout.shape[-2:])
-    return add_blur(slices, layout.new_tensor(_SLICED_VARIANCE_UM2), context.pitch_um, _SLICED_REACH_UM)
-
-
-def _step(dose: Tensor, threshold: Tensor, steepness: Tensor) -> Tensor:
-    low, high = (torch.sigmoid(steepness * (edge - threshold)) for edge in (0.0, 1.0))
-    return (torch.sigmoid(steepness * (dose - threshold)) - low) / (high - low)

@@ -9,15 +9,8 @@ import math
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
-from litho_models.effects.filters import (
-    add_filtered,
-    add_warp,
-    centred_lag,
-    dose_nearby,
-    gradient,
-    trailing_response,
-)
+from litho_models.effects.effect import ALONG_AXES, DIRECTION, FieldContext, Parameter, Values, of_exposure
+from litho_models.effects.filters import add_filtered, add_warp, gradient, trailing_response
 
 _TAIL_LENGTHS = 6
 # Lowest frequency of a ripple. Ripples of lower frequency cannot be distinguished from smooth changes over
@@ -56,7 +49,7 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
     radius = context.radius_um()
     tilt = values["tilt_x_um"] * x / radius + values["tilt_y_um"] * y / radius
     surface = tilt + values["curvature_um"] * (x * x + y * y) / radius**2
-    return height + (context.layout_um > 0).to(height.dtype) * surface
+    return height + torch.where(context.layout_um > 0, surface, 0.0)
 
 
 @of_exposure(
@@ -95,7 +88,7 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     nominal height nearby as a fraction of the full height.
     """
     substrate_um = values["substrate_um"]
-    thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
+    thinned = values["shrinkage"] * (1 - context.dose_nearby(values["length_um"]))
     lost_um = values["depth_um"] * (1 - thinned)
     return torch.where(height > substrate_um, torch.maximum(height - lost_um, substrate_um), height)
 
@@ -104,21 +97,21 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     "beam lagging behind the scan command along the written lines",
     {
         "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
-        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+        "direction": DIRECTION,
     },
     source="first-order lag of the deflection, l = speed x time constant",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Let the beam lag behind the commanded position: filter the layout along the written lines with a
-    one-sided exponential of length l = v τ (speed times time constant). The mean delay of this filter is
-    removed.
+    one-sided exponential of length l = v τ (speed times time constant). The mean delay l of this filter is
+    removed, because registration removes every mean shift.
     """
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-        along = fx if context.slow_axis == "y" else fy
-        return centred_lag(direction * along, length, pitch) - 1
+        along = direction * (fx if context.slow_axis == "y" else fy)
+        return trailing_response(along, length, pitch) * torch.exp(2j * math.pi * along * length) - 1
 
     return add_filtered(layout, transfer_minus_one, pitch, _TAIL_LENGTHS * float(length.detach()) + pitch)
 
@@ -126,7 +119,7 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 @of_exposure(
     "written lines that begin and end too late",
     {axis: Parameter("µm", -0.6, 0.6, 0.1) for axis in ("along_x_um", "along_y_um")},
-    trials=({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1}),
+    trials=ALONG_AXES,
     source="shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm",
     separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
 )
@@ -153,13 +146,12 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     If x is measured from the edge of the write field instead, the full displacement is c x (1 - x / 2R). The
     formula above leaves out the part of this displacement that registration removes.
     """
-    lines_along_x = context.slow_axis == "y"
-    y, x = context.scan_position()
-    half_um = context.whole_shape()[1 if lines_along_x else 0] * context.pitch_um / 2
+    fast = 1 if context.slow_axis == "y" else 0
+    half_um = context.whole_shape()[fast] * context.pitch_um / 2
     bulge_um = values["strength"] * half_um**2 / (2 * context.radius_um())
-    along = bulge_um * (1 / 3 - (x if lines_along_x else y) ** 2)
-    shifts = (0 * y, along) if lines_along_x else (along, 0 * x)
-    return add_warp(layout, *shifts, context.pitch_um)
+    shift_um = bulge_um * (1 / 3 - context.scan_position()[fast] ** 2)
+    shift_y, shift_x = (0.0, shift_um) if fast else (shift_um, 0.0)
+    return add_warp(layout, shift_y, shift_x, context.pitch_um)
 
 
 @of_exposure(
@@ -167,7 +159,7 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     {
         "strength": Parameter("1", -0.6, 0.6, 0.05),
         "length_um": Parameter("µm", 0.4, 20.0, 3.0, "shape", tried=(1.0, 3.0, 9.0)),
-        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+        "direction": DIRECTION,
     },
     stage="resist",
     source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
@@ -178,13 +170,13 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     depletion, and the kernel K_l is a one-sided exponential of length l along the slow axis.
     """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
-
-    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-        along = fy if context.slow_axis == "y" else fx
-        return -strength * trailing_response(direction * along, length, context.pitch_um)
-
-    reach_um = _TAIL_LENGTHS * float(length.detach())
-    starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
+    pitch, axis = context.pitch_um, "yx".index(context.slow_axis)
+    starved = add_filtered(
+        layout,
+        lambda *f: -strength * trailing_response(direction * f[axis], length, pitch),
+        pitch,
+        _TAIL_LENGTHS * float(length.detach()),
+    )
     # Where another effect has already made the dose negative, the dose is not reduced further.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
@@ -209,7 +201,7 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     The frequency f is the alias frequency |1/p - 1/dx|, where dx is the pixel size. The ripples have a fixed
     phase in the write field, so they are the same in every print.
     """
-    y, x = context.centred_um()
-    phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)
+    across_um = context.centred_um()["yx".index(context.slow_axis)]
+    phase = 2 * math.pi * values["frequency_per_um"] * across_um
     ripple = values["cosine_um"] * torch.cos(phase) + values["sine_um"] * torch.sin(phase)
-    return height + (context.layout_um > 0).to(height.dtype) * ripple
+    return height + torch.where(context.layout_um > 0, ripple, 0.0)

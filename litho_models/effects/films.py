@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from litho_data.foundation import Array
 from litho_models.effects.effect import FieldContext, Parameter, Values, entry
-from litho_models.effects.filters import add_blur, add_warp
+from litho_models.effects.filters import add_blur, add_scattered, add_warp, local_mean
 from litho_models.models.parts import etch
 
 # ``_NORMAL_PX``: standard deviation of the blur that is applied before the normals of edges are computed.
@@ -47,12 +47,8 @@ _of_films = partial(entry, role="process", of_films=True)
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that the substrate scatters back into the film: D = (M + η G_b * M) / (1 + η), where G_b
-    is a Gaussian of standard deviation b, * is convolution, and η is the weight.
-    """
-    weight, length = values["weight"], values["length_px"]
-    blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
-    return layout + weight / (1 + weight) * (blurred - layout)
+    """Add the dose that the substrate scatters back into the film; see ``add_scattered``."""
+    return add_scattered(layout, values["weight"], values["length_px"], 1.0)
 
 
 @_of_films(
@@ -106,12 +102,11 @@ edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards
 _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
 
 
-@entry(
+@_of_films(
     "edges shifted outwards by 2 M̄ - 1, which is 0 at a straight edge",
     {**etch_bias.parameters, "length_px": _DENSITY_PX},
     stage="development",
     acts_on="height",
-    of_films=True,
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -119,8 +114,7 @@ def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext)
     the edge that the film covers. If the bias is positive, edges with little film nearby therefore move
     inwards.
     """
-    length = values["length_px"]
-    nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
+    nearby = local_mean(height, values["length_px"], 1.0) / context.full_height_um
     return _moved(height, values["bias_px"] * (2 * nearby[0, 0] - 1), context)
 
 
@@ -184,13 +178,10 @@ def _crossings(share: Array) -> tuple[Array, Array]:
     normals at these points, which point into the film. Both arrays have shape (n, 2).
     """
     slopes = np.stack(np.gradient(gaussian_filter(share, _NORMAL_PX)), -1)
-    points, normals = [], []
-    for axis in (0, 1):
-        lower, upper = (np.take(share, range(i, share.shape[axis] - 1 + i), axis) for i in (0, 1))
-        at = np.argwhere((lower > 0.5) != (upper > 0.5))
-        next_to = at + np.eye(2, dtype=int)[axis]
-        first, second = share[tuple(at.T)], share[tuple(next_to.T)]
-        points.append(at + ((0.5 - first) / (second - first))[:, None] * (next_to - at))
-        slope = slopes[tuple(at.T)] + slopes[tuple(next_to.T)]
-        normals.append(slope / np.linalg.norm(slope, axis=-1, keepdims=True).clip(1e-12))
-    return np.concatenate(points), np.concatenate(normals)
+    crossed = [np.argwhere(np.diff(share > 0.5, axis=axis)) for axis in (0, 1)]
+    pixel = np.concatenate(crossed)
+    step = np.repeat(np.eye(2, dtype=int), [len(one) for one in crossed], axis=0)
+    here, there = tuple(pixel.T), tuple((pixel + step).T)
+    points = pixel + ((0.5 - share[here]) / (share[there] - share[here]))[:, None] * step
+    slope = slopes[here] + slopes[there]
+    return points, slope / np.linalg.norm(slope, axis=-1, keepdims=True).clip(1e-12)

@@ -12,10 +12,16 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import FieldContext
+from litho_models.models.features import neighbours
 
 # For slopes below this value, ``rounded_power`` is smoothed so that it stays differentiable.
 _LEAST_SLOPE = 1e-3
+
+
+def pixel_numbers(field: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the row numbers and the column numbers of the pixels, of shapes (ny, 1) and (1, nx)."""
+    y, x = (torch.arange(n, dtype=field.dtype, device=field.device) for n in field.shape[-2:])
+    return y[:, None], x[None, :]
 
 
 def add_filtered(
@@ -47,7 +53,7 @@ def add_filtered(
     return field + change[..., pad : pad + ny, pad : pad + nx]
 
 
-def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: float) -> Tensor:
+def add_blur(field: Tensor, variance_um2: Tensor | float, pitch_um: float, reach_um: float) -> Tensor:
     """Blur a field isotropically with a Gaussian of variance s² (µm²): T = exp(-2 π² s² f²)."""
     return add_filtered(
         field,
@@ -57,12 +63,18 @@ def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: flo
     )
 
 
-def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
-    """Return the mean nominal height around each pixel, as a fraction of the full height. The mean has
-    Gaussian weights with standard deviation ``length_um``. The result has shape (1, 1, ny, nx).
+def local_mean(field: Tensor, length_um: Tensor, pitch_um: float, reach: float = 3.0) -> Tensor:
+    """Return the mean of a field around each pixel. The mean has Gaussian weights with standard deviation
+    ``length_um``, and reaches to ``reach`` standard deviations.
     """
-    relative = context.layout_um / context.full_height_um
-    return add_blur(relative, length_um**2, context.pitch_um, 3 * float(length_um.detach()))
+    return add_blur(field, length_um**2, pitch_um, reach * float(length_um.detach()))
+
+
+def add_scattered(layout: Tensor, weight: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
+    """Add the dose that leaks in from the neighbourhood of each pixel: D = (M + η G_b * M) / (1 + η), where η
+    is the weight of this dose, G_b is a Gaussian of standard deviation b, and * is convolution.
+    """
+    return layout + weight / (1 + weight) * (local_mean(layout, length_um, pitch_um) - layout)
 
 
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
@@ -79,22 +91,12 @@ def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> 
     return torch.complex(real / squared, -imaginary / squared)
 
 
-def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """Return ``trailing_response`` without its mean delay l. The delay is removed because registration
-    removes every mean shift.
-    """
-    advance = torch.exp(2j * math.pi * frequency * length_um)
-    return trailing_response(frequency, length_um, pitch_um) * advance
-
-
 def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
     """Return the derivatives d/dy and d/dx of a field, per µm, by central differences with
     replicated edges.
     """
-    padded = functional.pad(field, (1, 1, 1, 1), mode="replicate")
-    along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / (2 * pitch_um)
-    along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / (2 * pitch_um)
-    return along_y, along_x
+    above, below, left, right = neighbours(functional.pad(field, (1, 1, 1, 1), mode="replicate"), 1)
+    return (below - above) / (2 * pitch_um), (right - left) / (2 * pitch_um)
 
 
 def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
@@ -104,7 +106,9 @@ def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
     return (squared_slope + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
 
 
-def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:
+def add_warp(
+    field: Tensor, shift_y_um: Tensor | float, shift_x_um: Tensor | float, pitch_um: float
+) -> Tensor:
     """Sample the field at (y + shift_y, x + shift_x) by cubic interpolation. A zero shift returns the field
     bit for bit.
 
@@ -112,16 +116,14 @@ def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: fl
         field: tensor of shape (1, 1, ny, nx).
         shift_y_um, shift_x_um: shifts in µm: maps of shape (ny, nx), or single numbers.
     """
-    ny, nx = field.shape[-2:]
-    y, x = (torch.arange(n, dtype=field.dtype, device=field.device) for n in (ny, nx))
-    rows, columns = y[:, None], x[None, :]
-    moved = _look_up(field, rows + shift_y_um / pitch_um, columns + shift_x_um / pitch_um)
-    return field + moved - _look_up(field, rows, columns)
+    return field + _moved(field, shift_y_um / pitch_um, shift_x_um / pitch_um) - _moved(field, 0.0, 0.0)
 
 
-def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:
-    ny, nx = field.shape[-2:]
+def _moved(field: Tensor, shift_y_px: Tensor | float, shift_x_px: Tensor | float) -> Tensor:
+    (ny, nx), (rows, columns) = field.shape[-2:], pixel_numbers(field)
     # Coordinates run from -1 to 1 over the field.
-    x, y = torch.broadcast_tensors(2 * x_px / max(nx - 1, 1) - 1, 2 * y_px / max(ny - 1, 1) - 1)
+    x, y = torch.broadcast_tensors(
+        2 * (columns + shift_x_px) / max(nx - 1, 1) - 1, 2 * (rows + shift_y_px) / max(ny - 1, 1) - 1
+    )
     grid = torch.stack([x, y], dim=-1).expand(len(field), ny, nx, 2)
     return functional.grid_sample(field, grid, mode="bicubic", padding_mode="border", align_corners=True)

@@ -19,7 +19,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
-from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
+from litho_models.effects.filters import add_filtered, gradient, local_mean, rounded_power, trailing_response
+from litho_models.layers.pixelwise import interpolate
 
 # Frequencies of waves that screening tries. These frequencies are so close together that a wave of any
 # frequency between two neighbours stays nearly in phase with one of the two over a height of one micrometre.
@@ -73,16 +74,17 @@ class Surface:
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return the value, at each pixel, of a function of the position in the scan. ``word`` is the name of
-        the function: ``x``, ``y``, ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of
-        the pixel from the edge of the scan and ``length`` is a parameter of the law.
+        """Return a function of the position in the scan, as a tensor that can be broadcast to the shape of
+        the field. ``word`` is the name of the function: ``x``, ``y``, ``r²`` or ``rim``. ``rim`` is
+        e^(-d / length), where d is the distance of the pixel from the edge of the scan and ``length`` is a
+        parameter of the law.
         """
         y, x = self.context.scan_position()
         if word == "rim":
             sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
             own_um = [side * (1 - one.abs()) for side, one in zip(sides_um, (y, x), strict=True)]
             return torch.exp(-torch.minimum(*own_um) / self.values["length_um"]).to(self.h)
-        return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
+        return {"x": x, "y": y, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
         """Return a step function along an axis of the scan. The parameter ``position`` of the law gives the
@@ -97,8 +99,7 @@ class Surface:
         """Return the Gaussian-weighted local mean of a map (by default the height). The standard deviation of
         the Gaussian is the parameter ``length_um`` of the law.
         """
-        field, reach = self.h if of is None else of, self.values["length_um"]
-        return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
+        return local_mean(self.h if of is None else of, self.values["length_um"], self.context.pitch_um, 4)
 
     def trailing(self, *sides: str) -> Tensor:
         """Return the weighted mean height on one side of each pixel, or on two sides. The weights decay
@@ -116,7 +117,6 @@ class Surface:
 # A function that computes the map by which the strength of a law is multiplied. The map has shape (b, 1, ny,
 # nx).
 Column = Callable[[Surface], Tensor]
-_UNIT_OF_STRENGTH = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
 
 
 def _law(
@@ -128,13 +128,13 @@ def _law(
     on: ActsOn = "height",
 ) -> Effect:
     """Make a law from its name, its formula (as text), and the function ``column``, which computes the map
-    that is multiplied by the strength. ``unit`` is the unit of this map.
+    that is multiplied by the strength. ``unit`` is the unit of the strength.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
         return field + values["strength"] * column(Surface(field, context, values))
 
-    strength = Parameter(_UNIT_OF_STRENGTH[unit], -4.0, 4.0, 0.05)
+    strength = Parameter(unit, -4.0, 4.0, 0.05)
     return _nameless(name.replace("²", "2"), formula, {"strength": strength, **shapes}, apply, on)
 
 
@@ -189,65 +189,65 @@ _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
 
 
 def _along_axis(a: str) -> Iterator[Effect]:
-    yield _law(f"height-times-slope-{a}", f"h ∂h/∂{a}", "µm", lambda s: s.h * s.slope(a))
-    yield _law(f"height-times-slope-size-{a}", f"h |∂h/∂{a}|", "µm", lambda s: s.h * s.size(a))
-    yield _law(f"curvature-{a}", f"∂²h/∂{a}²", "1/µm", lambda s: s.slope(a, s.slope(a)))
-    yield _law(f"slope-size-{a}-times-order", f"|∂h/∂{a}| t", "1", lambda s: s.size(a) * s.context.order)
+    yield _law(f"height-times-slope-{a}", f"h ∂h/∂{a}", "1", lambda s: s.h * s.slope(a))
+    yield _law(f"height-times-slope-size-{a}", f"h |∂h/∂{a}|", "1", lambda s: s.h * s.size(a))
+    yield _law(f"curvature-{a}", f"∂²h/∂{a}²", "µm²", lambda s: s.slope(a, s.slope(a)))
+    yield _law(f"slope-size-{a}-times-order", f"|∂h/∂{a}| t", "µm", lambda s: s.size(a) * s.context.order)
     yield from (_slope_at(a, word) for word in _WORDS)
 
 
 def _slope_at(a: str, word: str, shapes: Mapping[str, Parameter] = {}) -> Effect:
     name, formula = f"slope-size-{a}-times-{word}", f"|∂h/∂{a}| {word}"
-    return _law(name, formula, "1", lambda s: s.size(a) * s.place(word), shapes)
+    return _law(name, formula, "µm", lambda s: s.size(a) * s.place(word), shapes)
 
 
 def _height_at(word: str, shapes: Mapping[str, Parameter] = {}) -> Effect:
-    return _law(f"height-times-{word}", f"h {word}", "µm", lambda s: s.h * s.place(word), shapes)
+    return _law(f"height-times-{word}", f"h {word}", "1", lambda s: s.h * s.place(word), shapes)
 
 
 def _blurred_at(word: str) -> Effect:
     name, formula = f"blur-times-{word}", f"(h̄ - h) {word}"
-    return _law(name, formula, "µm", lambda s: (s.mean() - s.h) * s.place(word), _NEAR)
+    return _law(name, formula, "1", lambda s: (s.mean() - s.h) * s.place(word), _NEAR)
 
 
 def _power(a: str) -> Effect:
     name, formula = f"slope-{a}-power", f"|∂h/∂{a}|^power"
-    return _law(name, formula, "1", lambda s: s.size(a, power=s.values["power"]), _POWER | _TURN)
+    return _law(name, formula, "µm", lambda s: s.size(a, power=s.values["power"]), _POWER | _TURN)
 
 
 def _one_way(a: str) -> Iterator[Effect]:
-    yield _law(f"rising-slope-{a}", f"max(∂h/∂{a}, 0)", "1", lambda s: s.slope(a).relu(), _TURN)
-    yield _law(f"falling-slope-{a}", f"max(-∂h/∂{a}, 0)", "1", lambda s: (-s.slope(a)).relu(), _TURN)
+    yield _law(f"rising-slope-{a}", f"max(∂h/∂{a}, 0)", "µm", lambda s: s.slope(a).relu(), _TURN)
+    yield _law(f"falling-slope-{a}", f"max(-∂h/∂{a}, 0)", "µm", lambda s: (-s.slope(a)).relu(), _TURN)
 
 
 def _jumps(a: str) -> Iterator[Effect]:
     name, formula = f"jump-along-{a}-in", f"({a} > position)"
-    yield _law(f"{name}-height", formula, "1", lambda s: s.beyond(a), _POSITION)
-    yield _law(f"{name}-gain", f"h {formula}", "µm", lambda s: s.h * s.beyond(a), _POSITION)
-    yield _law(f"{name}-x", f"∂h/∂x {formula}", "1", lambda s: s.slope("x") * s.beyond(a), _POSITION)
-    yield _law(f"{name}-y", f"∂h/∂y {formula}", "1", lambda s: s.slope("y") * s.beyond(a), _POSITION)
+    yield _law(f"{name}-height", formula, "µm", lambda s: s.beyond(a), _POSITION)
+    yield _law(f"{name}-gain", f"h {formula}", "1", lambda s: s.h * s.beyond(a), _POSITION)
+    yield _law(f"{name}-x", f"∂h/∂x {formula}", "µm", lambda s: s.slope("x") * s.beyond(a), _POSITION)
+    yield _law(f"{name}-y", f"∂h/∂y {formula}", "µm", lambda s: s.slope("y") * s.beyond(a), _POSITION)
 
 
 def _beside(name: str, *sides: str) -> Effect:
     formula = f"(mean of D {' and '.join(sides)} over the length) - D"
-    return _law(name, formula, "µm", lambda s: s.trailing(*sides) - s.h, _TAIL, "layout")
+    return _law(name, formula, "1", lambda s: s.trailing(*sides) - s.h, _TAIL, "layout")
 
 
 _FOUND = [
     *_along_axis("x"),
     *_along_axis("y"),
-    _law("height-power-2", "h²", "µm²", lambda s: s.h**2),
-    _law("height-power-3", "h³", "µm³", lambda s: s.h**3),
-    _law("height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order),
+    _law("height-power-2", "h²", "1/µm", lambda s: s.h**2),
+    _law("height-power-3", "h³", "1/µm²", lambda s: s.h**3),
+    _law("height-squared-times-order", "h² t", "1/µm", lambda s: s.h**2 * s.context.order),
     *map(_height_at, _WORDS),
-    _law("steepness-power", "|∇h|^power", "1", lambda s: s.size("x", "y", power=s.values["power"]), _POWER),
+    _law("steepness-power", "|∇h|^power", "µm", lambda s: s.size("x", "y", power=s.values["power"]), _POWER),
     *map(_power, "xy"),
     *_one_way("x"),
     *_one_way("y"),
-    _law("surroundings", "h̄ - h", "µm", lambda s: s.mean() - s.h, _REACH),
-    _law("blur-height", "h (h̄ - h)", "µm²", lambda s: s.h * (s.mean() - s.h), _REACH),
-    _law("above-surroundings", "(h - h̄)²", "µm²", lambda s: (s.h - s.mean()) ** 2, _REACH),
-    _law("steps-nearby", "mean of |∇h| within the length", "1", lambda s: s.mean(s.size("x", "y")), _REACH),
+    _law("surroundings", "h̄ - h", "1", lambda s: s.mean() - s.h, _REACH),
+    _law("blur-height", "h (h̄ - h)", "1/µm", lambda s: s.h * (s.mean() - s.h), _REACH),
+    _law("above-surroundings", "(h - h̄)²", "1/µm", lambda s: (s.h - s.mean()) ** 2, _REACH),
+    _law("steps-nearby", "mean of |∇h| within the length", "µm", lambda s: s.mean(s.size("x", "y")), _REACH),
     _height_at("rim", _NEAR),
     _slope_at("x", "rim", _NEAR),
     _slope_at("y", "rim", _NEAR),
@@ -260,7 +260,7 @@ _FOUND = [
     _law(
         "dose-times-density",
         "D (mean of D within the length / full height)^power",
-        "µm",
+        "1",
         lambda s: s.h * rounded_power((s.mean() / s.context.full_height_um) ** 2, s.values["power"]),
         _REACH | _POWER,
         "layout",
@@ -289,10 +289,8 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
     """
     knots = torch.stack([values[name] for name in _KNOTS])
     smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
-    share = (smooth / context.full_height_um * _LAST_KNOT).clamp(0, _LAST_KNOT)
-    below = share.floor().clamp(max=_LAST_KNOT - 1)
-    at = below.long()
-    return height + knots[at] + (share - below) * (knots[at + 1] - knots[at])
+    full = context.full_height_um
+    return height + interpolate(smooth.clamp(0, full), knots, 0.0, full)
 
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
@@ -303,10 +301,10 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
-    total = height * (1 - sum(values[name] for name in _COPIES_UM))
+    total = height
     for name, (dy, dx) in _COPIES_UM.items():
-        top, left = edge + round(dy / pitch), edge + round(dx / pitch)
-        total = total + values[name] * padded[..., top : top + ny, left : left + nx]
+        there = padded[..., edge + round(dy / pitch) :, edge + round(dx / pitch) :][..., :ny, :nx]
+        total = total + values[name] * (there - height)
     return total
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import FieldContext, Parameter, Values, of_microscope
+from litho_models.effects.effect import DIRECTION, FieldContext, Parameter, Values, of_microscope
 from litho_models.effects.filters import add_blur, add_warp
 
 # Weights of cubic interpolation half-way between four neighbours.
@@ -26,7 +26,7 @@ _BLUR_REACH_UM = 4.0
     {
         "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
         "rising": Parameter("1", 0.0, 1.0, 0.5, "shape", tried=(1.0, 0.4)),
-        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+        "direction": DIRECTION,
     },
     source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
     separating="compare trace and retrace; scan at 0 and 90 degrees",
@@ -53,7 +53,7 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
         followed.append(followed[-1] + torch.where(error > 0, up, down) * error)
     late = torch.stack(followed[::forward], dim=-1)
     delay = forward * (length + rising) / 2
-    return add_warp(late, 0 * delay, delay, pitch)
+    return add_warp(late, 0.0, delay, pitch)
 
 
 @of_microscope(
@@ -70,9 +70,9 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     The full displacement is c x (1 - x / L), where x is measured from the start of the line. The formula
     leaves out the part of this displacement that registration removes.
     """
-    y, x = context.scan_position()
+    _, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
-    return add_warp(height, 0 * y, values["strength"] * length_um / 4 * (1 / 3 - x**2), context.pitch_um)
+    return add_warp(height, 0.0, values["strength"] * length_um / 4 * (1 / 3 - x**2), context.pitch_um)
 
 
 @of_microscope(
@@ -136,24 +136,28 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     not lie on the piece, the tip touches the piece at the end that is nearer to this point.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
-    middles = _middles(height)
-    # Slopes of the pieces to the right of each pixel, then of the pieces to the right of each mid-point.
-    slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
-    steepest = max(float(s.detach().abs().max()) for s in slopes)
+    last = height[..., -1:]
+    ahead = torch.cat([height[..., 1:], last], dim=-1)
+    # Cubic polynomials through four neighbours give the heights half-way between pixels.
+    near = functional.pad(height, (1, 1, 0, 0), mode="replicate").unfold(-1, len(_MIDDLE), 1)
+    middles = torch.cat([near @ height.new_tensor(_MIDDLE), last], dim=-1)
+    # The pieces to the right of each pixel, then the pieces to the right of each mid-point.
+    begins = torch.stack([height, middles])
+    slopes = (torch.stack([middles, ahead]) - begins) / half_um
+    steepest = float(slopes.detach().abs().max())
     # The tip cannot touch a point that is farther from its axis than R s, where s is the steepest slope. Nor
     # can it touch a point that is so far away that the parabola has risen there by more than the whole height
     # range.
-    tops_um = torch.stack([height, middles]).detach()
-    deepest_um = math.sqrt(2 * float(radius_um.detach() * (tops_um.max() - tops_um.min())))
+    deepest_um = math.sqrt(2 * float((radius_um * (begins.max() - begins.min())).detach()))
     farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
     reach_px = min(math.ceil(farthest_um / pitch_um) + 1, size)
-    starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
-    rises = [_continued(part, reach_px, "constant") for part in slopes]
+    edge = (reach_px, reach_px, 0, 0, 0, 0)
+    starts, rises = functional.pad(begins, edge, mode="replicate"), functional.pad(slopes, edge)
     # The gradient of the maximum is the gradient of the piece that the tip touches. The search for this piece
     # runs without gradients, because with gradients it would keep all pieces in memory.
     with torch.no_grad():
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
-        touches = [radius_um * slope for slope in rises]
+        touches = radius_um * rises
         bend = float(-0.5 / radius_um)
         for offset in range(-2 * reach_px, 2 * reach_px):
             away_px, middle = divmod(offset, 2)
@@ -166,24 +170,7 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
             on.masked_fill_(tip > highest, offset)
             highest = torch.maximum(highest, tip)
     piece = on + 2 * (torch.arange(size, device=height.device) + reach_px)
-    start, slope = (torch.stack(part, dim=-1).flatten(-2).gather(-1, piece) for part in (starts, rises))
+    start, slope = (part.movedim(0, -1).flatten(-2).gather(-1, piece) for part in (starts, rises))
     begins_um = on.to(height.dtype) * half_um
     touch = (radius_um * slope).clamp(begins_um, begins_um + half_um)
     return start + slope * (touch - begins_um) - touch**2 / (2 * radius_um)
-
-
-def _middles(rows: Tensor) -> Tensor:
-    """Interpolate rows half a pixel to the right of each pixel, by a cubic polynomial through four
-    neighbours. ``rows`` and the result have shape (..., nx).
-    """
-    padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
-    middles = padded.unfold(-1, len(_MIDDLE), 1) @ rows.new_tensor(_MIDDLE)
-    return torch.cat([middles[..., :-1], rows[..., -1:]], dim=-1)
-
-
-def _next(rows: Tensor) -> Tensor:
-    return torch.cat([rows[..., 1:], rows[..., -1:]], dim=-1)
-
-
-def _continued(rows: Tensor, by_px: int, mode: str) -> Tensor:
-    return functional.pad(rows, (by_px, by_px, 0, 0), mode=mode)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import FieldContext, Parameter, Values, of_development, of_resist
-from litho_models.effects.filters import add_blur, add_warp, dose_nearby, gradient, rounded_power
+from litho_models.effects.effect import ALONG_AXES, FieldContext, Parameter, Values, of_development, of_resist
+from litho_models.effects.filters import add_blur, add_warp, gradient, rounded_power
 
 _BLUR_REACH_UM = 4.0
 _OF_NARROW = {
@@ -98,7 +98,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     """Shrink the print more where its surroundings are thin: H (1 - k (1 - u)), where u is the mean nominal
     height nearby as a fraction of the full height.
     """
-    return height * (1 - values["fraction"] * (1 - dose_nearby(context, values["length_um"])))
+    return height * (1 - values["fraction"] * (1 - context.dose_nearby(values["length_um"])))
 
 
 @of_development(
@@ -174,22 +174,18 @@ def _closed_by(height: Tensor, half_px: int) -> Tensor:
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """Return the largest value in the square around each pixel, computed along one axis after the other. The
-    result leaves out the pixels whose square extends beyond the field.
+    """Return the largest value in the square around each pixel, computed along one axis after the other. Each
+    step of the computation doubles the number of pixels that are included. The result leaves out the pixels
+    whose square extends beyond the field.
     """
-    return _running_maximum(_running_maximum(field, half_px, -2), half_px, -1)
-
-
-def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
-    """Return, for each pixel, the maximum over 2 half_px + 1 pixels along an axis. Each step of the
-    computation doubles the number of pixels that are included.
-    """
-    size, width = 2 * half_px + 1, 1
-    while width < size:
-        shift = min(width, size - width)
-        left = field.shape[axis] - shift
-        field = torch.maximum(field.narrow(axis, 0, left), field.narrow(axis, shift, left))
-        width += shift
+    size = 2 * half_px + 1
+    for axis in (-2, -1):
+        width = 1
+        while width < size:
+            shift = min(width, size - width)
+            left = field.shape[axis] - shift
+            field = torch.maximum(field.narrow(axis, 0, left), field.narrow(axis, shift, left))
+            width += shift
     return field
 
 
@@ -206,7 +202,7 @@ def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
         {**axes, "exponent": power, "turn_deg": turn}
         for power in (1.0, 2.0)
         for turn in (0.0, 45.0)
-        for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
+        for axes in ALONG_AXES
     ),
     source="empirical: the loss is a power of the slope, with an ellipse of coefficients in rotated axes",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",

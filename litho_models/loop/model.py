@@ -213,7 +213,7 @@ class Twin:
         for name, one in self.effects.items():
             seen = {label_of(scan.stored, one.by) for scan in scans}
             known = {label: own for label, own in one.values.items() if label in seen}
-            known = known or {"": get_effect(name).off_values()}
+            known = known or {"": get_effect(name).with_values({})}
             effects[name] = replace(
                 one, values={label: Added(one.by, known).of(label) for label in one.values}
             )

@@ -50,7 +50,7 @@ def plant(
         close_again: function that runs the same loop on the scans that it receives.
     """
     amplitude = effect.amplitudes[0]
-    values = {effect.name: {**effect.off_values(), amplitude: amount}}
+    values = {effect.name: effect.with_values({amplitude: amount})}
     twin = closed.base.twin
     changed, squares = [], []
     for scan in closed.given.scans:

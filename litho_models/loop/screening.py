@@ -100,7 +100,7 @@ class Trial:
         steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
         values = np.clip(null + steps, lower, upper).tolist()
         amplitudes = dict(zip(self.effect.amplitudes, values, strict=True))
-        return {**self.effect.off_values(), **self.sets[0], **amplitudes}
+        return self.effect.with_values({**self.sets[0], **amplitudes})
 
 
 def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:

@@ -75,7 +75,7 @@ def test_fab_and_catalogue_agree_on_stage_and_role() -> None:
 @PER_EFFECT
 def test_off_is_the_identity(effect: Effect) -> None:
     array, context = input_of(effect)
-    changed = effect(array, effect.off_values(), context)
+    changed = effect(array, effect.with_values({}), context)
     # Some effects scale heights and scale them back in float64, whose rounding is far below 1e-7.
     assert torch.allclose(changed, array, rtol=0, atol=1e-7)
 
@@ -120,7 +120,7 @@ def test_gradient_equals_finite_difference(effect: Effect) -> None:
 @PER_EFFECT
 def test_gradient_to_the_field_is_finite_when_off_and_on(effect: Effect) -> None:
     array, context = input_of(effect)
-    for values in (effect.off_values(), {name: p.typical for name, p in effect.parameters.items()}):
+    for values in (effect.with_values({}), {name: p.typical for name, p in effect.parameters.items()}):
         leaf = array.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(effect(leaf, values, context).sum(), leaf)
         assert torch.isfinite(gradient).all()
@@ -139,7 +139,7 @@ def test_parameters_have_units_and_bounds_that_hold_their_values(effect: Effect)
     assert (effect.stage == "measurement") == (effect.role == "measurement")
     assert effect.trials
     for trial in effect.trials:
-        assert effect.with_values(trial) != effect.off_values()
+        assert effect.with_values(trial) != effect.with_values({})
 
 
 def test_screened_effects_and_forward_order() -> None:
@@ -253,7 +253,7 @@ def test_a_negative_dose_of_another_effect_is_kept_by_one_that_is_off() -> None:
     layout, context = field()
     layout = layout - 0.3
     effect = get_effect("write-order-memory")
-    assert torch.allclose(effect(layout, effect.off_values(), context), layout, rtol=0, atol=1e-12)
+    assert torch.allclose(effect(layout, effect.with_values({}), context), layout, rtol=0, atol=1e-12)
 
 
 def test_write_order_memory_makes_no_negative_dose() -> None:
