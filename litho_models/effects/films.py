@@ -157,8 +157,6 @@ def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
     """
     points, normals = _crossings(share)
     distance, normal = np.where(share > 0.5, reach_px, -reach_px), np.zeros((2, *share.shape))
-    if not len(points):
-        return distance, normal
     pixels = np.moveaxis(np.indices(share.shape, float), 0, -1)
     away_px, nearest = cKDTree(points).query(pixels, distance_upper_bound=reach_px)
     near = nearest < len(points)
