@@ -115,7 +115,7 @@ def surely_better(
 
 
 # Numbers of prints for which the power is computed.
-_COUNTS = range(1, 13)
+COUNTS = range(1, 13)
 # Number of times that the parameters of the rivals are drawn at random within their uncertainty. The power is
 # averaged over these draws, because the difference between two rivals may depend on the parameters.
 DRAWS = 8
@@ -189,7 +189,7 @@ def _pairs(rivalry: Rivalry, prints: Sequence[Print]) -> list[PlannedPair]:
     for _ in range(DRAWS):
         drawn = rivalry.drawn(random)
         shown = drawn.contrasts(prints, drawn.refitted(prints, first=first)).values()
-        powers.append([[of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in shown])
+        powers.append([[of_contrast(one, rivalry.question, n) for n in COUNTS] for one in shown])
     fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2, first=first))
     mean = dict(zip(fitted, np.mean(powers, axis=0).tolist(), strict=True))
     found = []
@@ -223,7 +223,7 @@ def of_others(
         sd_um = next(iter(question.sizes.values()), 0.0)
         return _planned(
             question,
-            [of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS],
+            [of_lines(sd_um, open_.noise, size_px, n) for n in COUNTS],
             prints,
             ["in a rotated scan, scan lines and written lines run along different axes of the layout"],
             [
@@ -234,7 +234,7 @@ def of_others(
     if question.kind == "per-scan":
         return _planned(
             question,
-            [of_repeats(n, scans) for n in _COUNTS],
+            [of_repeats(n, scans) for n in COUNTS],
             prints,
             [
                 "every print is remounted and scanned again, and a term that the printer causes is then the "
@@ -247,7 +247,7 @@ def of_others(
             ],
         )
     told = [f"when the dataset card states the missing fact, the loop can test {question.name}"]
-    return _planned(question, [0.0 for _ in _COUNTS], prints, [question.experiment], told)
+    return _planned(question, [0.0 for _ in COUNTS], prints, [question.experiment], told)
 
 
 def _planned(
@@ -268,7 +268,7 @@ def _planned(
         status=status,
         why="; ".join(why),
         power=powers,
-        prints_needed=next((n for n, power in zip(_COUNTS, powers, strict=True) if power >= ENOUGH), None),
+        prints_needed=next((n for n, power in zip(COUNTS, powers, strict=True) if power >= ENOUGH), None),
         outcomes=outcomes,
         **{"random_power": powers, **known},
     )

@@ -26,7 +26,7 @@ from litho_models.effects import FieldContext
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
 from litho_models.loop.run import MODEL_FOLDER
-from litho_models.planning.answers import of_others, of_rivals
+from litho_models.planning.answers import COUNTS, of_others, of_rivals
 from litho_models.planning.layouts import Limits, assemble, choose, climbed, starts, together
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint, PlannedScan
@@ -97,8 +97,8 @@ def next_print(
 
     Raises:
         InputError: ``loop`` contains no closed loop on scans of heights, the layouts of the earlier prints
-            have only one level, ``prints`` is below 1, ``field_um`` is too small, or ``out`` contains a plan
-            with other settings.
+            have only one level, ``prints`` is not between 1 and 12, ``field_um`` is too small, or ``out``
+            contains a plan with other settings.
     """
     folder = Path(loop)
     if not (folder / OpenQuestions.FILE_NAME).is_file():
@@ -118,11 +118,11 @@ def next_print(
     facts = {"dataset": open_.dataset.model_dump(mode="json"), "settings": asked}
     card = ModelCard.read(folder / MODEL_FOLDER)
     size_px = round(field_um / card.pitch_um)
-    if size_px < _SMALLEST_PX or prints < 1:
+    if size_px < _SMALLEST_PX or prints not in COUNTS:
         raise InputError(
             "planned prints",
             got=f"{prints} of {field_um:g} µm",
-            wanted=f"at least one print with a side of at least {_SMALLEST_PX * card.pitch_um:g} µm",
+            wanted=f"1 to {max(COUNTS)} prints with a side of at least {_SMALLEST_PX * card.pitch_um:g} µm",
         )
     with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
         base = load_simulator(folder / MODEL_FOLDER, card)
@@ -199,9 +199,9 @@ def schedule(
     """
     size_px = len(levels[0])
     # A staircase looks the same when it is shifted, so its position could not be determined. It is therefore
-    # surrounded by a random frame if there is room.
+    # surrounded by a random frame if there is room for three steps.
     ladder = limits.random(size_px, seed + 13)
-    if size_px >= _LADDER_PX:
+    if size_px >= _LADDER_PX and limits.highest - limits.lowest > 1:
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
     unprinted = flat((size_px, size_px), level=0)
     middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)

@@ -497,6 +497,26 @@ def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
         next_print(loop, tmp_path / "plan")
 
 
+@pytest.mark.parametrize(("prints", "field_um"), [(0, 25.6), (13, 25.6), (2, 3.0)])
+def test_numbers_and_sizes_of_prints_that_cannot_be_planned_are_refused(
+    prints: int, field_um: float, tmp_path: Path
+) -> None:
+    loop = closed_loop(tmp_path / "loop", [slope_question()])
+    with pytest.raises(
+        InputError, match=f"got {prints} of {field_um:g} µm, wanted 1 to 12 prints with a side"
+    ):
+        next_print(loop, tmp_path / "plan", prints=prints, field_um=field_um)
+
+
+def test_a_printer_with_two_usable_levels_gets_no_staircase(tmp_path: Path) -> None:
+    loop = closed_loop(tmp_path / "loop", [slope_question()])
+    two = [0.5 * (level in (5, 6)) for level in range(13)]
+    opened([slope_question()]).model_copy(update={"level_share": two}).write(loop)
+    plan = next_print(loop, tmp_path / "plan", prints=2, field_um=30.0, steps=1)
+    assert plan is not None
+    assert plan.levels == (5, 6)
+
+
 def test_the_page_quotes_the_plan_for_the_measured_prints() -> None:
     plan = NextPrint.read(measured_plan.RESULTS)
     for name, text in measured_plan.texts(plan).items():
