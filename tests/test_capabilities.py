@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from typer.main import get_command
+from typer.testing import CliRunner
 
 ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tests" / "capabilities.toml"
@@ -161,3 +162,22 @@ def test_every_command_option_and_name_in_the_list_exists():
                 or parts[-1] == "__version__"
                 or any(shown.startswith(f"{name}.") for shown in public)
             ), f"{name} in {how}"
+
+
+def test_the_help_of_every_command_fits_one_screen() -> None:
+    """Check 50 lines of 80 characters. Further options are shown by ``--help-all``."""
+    helps = {}
+    for package in PACKAGES:
+        app = importlib.import_module(f"{package}.cli.app").app
+        for words in commands_of(get_command(app)):
+            helps[package, *words] = CliRunner().invoke(app, [*words, "--help"]).output.splitlines()
+    assert len(helps) > 35
+    assert {name: len(lines) for name, lines in helps.items() if len(lines) > 50} == {}
+    assert max(len(line) for lines in helps.values() for line in lines) <= 80
+
+
+def commands_of(command: Any, *words: str) -> Iterator[tuple[str, ...]]:
+    """Return the words that call each command of a program, the program itself included."""
+    yield words
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from commands_of(inner, *words, name)

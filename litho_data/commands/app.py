@@ -11,6 +11,7 @@ from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from litho_data.commands.progress import command_line, given_words, never_silent
 from litho_data.foundation import InputError, unknown_name
@@ -33,16 +34,19 @@ def argument(help: str) -> Any:
     return typer.Argument(help=help)
 
 
+# The heading under which the help lists options that change how a result is computed, but not the result.
+COMPUTING = "Computing"
 _CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
 _LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, help="number of local processes; the result does not depend on it")
+    int, option("number of local processes", "--workers", min=1, rich_help_panel=COMPUTING)
 ]
 DaskOption = Annotated[
     str | None,
     option(
         "address of a Dask scheduler, such as tcp://host:8786; its workers replace the local processes",
         "--dask",
+        rich_help_panel=COMPUTING,
     ),
 ]
 
@@ -117,6 +121,29 @@ def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
     return takes_more(run, command, [keyword("help_all", HelpAll, False)])
 
 
+class _Command(typer.core.TyperCommand):
+    """A command whose help lists the options under headings."""
+
+    def format_options(self, context: Any, formatter: Any) -> None:
+        """Write the arguments and the visible options into the help, each under its heading."""
+        found: dict[str, list[Any]] = {}
+        for one in self.get_params(context):
+            usual = "Arguments" if one.param_type_name == "argument" else "Options"
+            if record := one.get_help_record(context):
+                found.setdefault(getattr(one, "rich_help_panel", None) or usual, []).append(record)
+        for heading, records in found.items():
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+class _App(typer.Typer):
+    """An application whose commands are of the class ``_Command``."""
+
+    def command(self, *names: Any, **more: Any) -> Any:
+        """Return typer's decorator that makes a function a command."""
+        return super().command(*names, cls=_Command, **more)
+
+
 def new_app(help_text: str) -> typer.Typer:
     """Make a typer application with the settings of this project."""
 
@@ -143,7 +170,7 @@ def new_app(help_text: str) -> typer.Typer:
             raise typer.Exit(2)
 
     # Without invoke_without_command, --version alone would fail because no command is given.
-    return typer.Typer(
+    return _App(
         help=help_text,
         callback=options,
         invoke_without_command=True,

@@ -58,17 +58,18 @@ def wanted() -> PaperCopies:
 
 
 def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options ``--figures`` and ``--tables`` to a command that writes a report."""
+    """Add the hidden options ``--figures`` and ``--tables`` to a command that writes a report."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
         with paper_copies(values.pop("figures"), values.pop("tables")):
             command(**values)
 
-    figures = Annotated[
-        Figures | None, option("also write the figures in this format, as wide as a paper's column")
+    written = "also write the figures in this format, as wide as a paper's column"
+    figures = Annotated[Figures | None, option(written, hidden=True)]
+    tables = Annotated[
+        Tables, option("also write the tables in this format, in addition to CSV", hidden=True)
     ]
-    tables = Annotated[Tables, option("also write the tables in this format, in addition to CSV")]
     return takes_more(run, command, [keyword("figures", figures), keyword("tables", tables, "csv")])
 
 

@@ -57,18 +57,17 @@ Judges = Annotated[
     list[str] | None,
     typer.Option(
         "--judge",
-        help="model that predicts the print of the finished layout: NAME=MODEL or MODEL; repeatable. By "
-        "default, the zoo's models of the same printer are used",
+        help="MODEL or NAME=MODEL that judges the design; by default all of this printer in the zoo",
     ),
 ]
 Robust = Annotated[
     bool,
-    typer.Option(help="search for the layout that has the lowest loss over the model and all its judges"),
+    typer.Option(help="search for the lowest loss over the model and all judges"),
 ]
 Objects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="computational lens: image, or folder of images, that replaces the built-in drawings; repeatable"
+        help="computational lens: image or folder of images to use instead of the drawings; repeatable"
     ),
 ]
 HeldOutObjects = Annotated[
@@ -148,10 +147,7 @@ def correct(
     scan: MeasuredSource | None,
     after: Annotated[
         Path | None,
-        typer.Option(
-            help="folder of a first correction that was printed and measured; the measured error of its "
-            "print is subtracted from the target"
-        ),
+        typer.Option(help="folder of a correction that was printed and measured, whose error is subtracted"),
     ] = None,
     spread_of: SpreadOf = None,
     judge: Judges = None,
@@ -159,10 +155,9 @@ def correct(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Find the layout whose print comes closest to the target relief; an interrupted run in OUT resumes.
+    """Find the layout whose print comes closest to a target relief.
 
     Example: litho-design correct blaze --model zoo:pbl --out blaze
-    Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
     """
     settings = _settings(given, relief_settings, "correct", spread_of)
     from litho_design.workflows.design import correct as correct_relief
@@ -206,14 +201,13 @@ def lens(
     _print_design(design, out)
 
 
-@with_paper_copies
 @takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
+@with_paper_copies
 def compare(
     models: Annotated[
         str,
         typer.Option(
-            help="models to design with (the arms), separated by commas: none, NAME=MODEL or MODEL (a "
-            "folder, or zoo:NAME)"
+            help="models to design with, separated by commas: none, MODEL (folder or zoo:NAME) or NAME=MODEL"
         ),
     ],
     out: Out,
@@ -221,8 +215,7 @@ def compare(
     judge: Annotated[
         list[str] | None,
         typer.Option(
-            help="further model that only judges: NAME=MODEL or MODEL (or the truth/ folder of a virtual "
-            "fab); repeatable"
+            help="model that only judges: NAME=MODEL or MODEL, or truth/ of a virtual fab; repeatable"
         ),
     ] = None,
     task: Annotated[
@@ -232,7 +225,7 @@ def compare(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    seeds: Annotated[int, typer.Option(help="number of seeds, which are 0, 1, 2 …")] = 3,
+    seeds: Annotated[int, typer.Option(help="number of seeds (0, 1, 2 …)")] = 3,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     device: Device = "cpu",
@@ -240,7 +233,7 @@ def compare(
 ) -> None:
     """Design with every model (arm), and compare how every judge predicts the prints of these designs.
 
-    Example: litho-design compare --models none,zoo:pbl --judge zoo:physics --out gap
+    Example: litho-design compare --models none,zoo:pbl --out gap
     """
     settings: Any
     if task == "hoe":

@@ -16,12 +16,12 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import typer
 from pydantic import BaseModel, ValidationError
 
-from litho_data.commands.app import keyword, takes, takes_more, with_further_options
+from litho_data.commands.app import COMPUTING, keyword, takes, takes_more, with_further_options
 from litho_data.commands.settings import Leaf, assigned, flattened, leaf_of, leaves, read_settings, refused
 from litho_data.foundation.errors import InputError
 
-Out = Annotated[Path, typer.Option(help="folder of the result; a folder that holds anything else is refused")]
-Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
+Out = Annotated[Path, typer.Option(help="folder of the result")]
+Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …", rich_help_panel=COMPUTING)]
 Extrapolate = Annotated[
     bool,
     typer.Option(
@@ -43,15 +43,14 @@ _Config = Annotated[
     Path | None,
     typer.Option(
         "--config",
-        help="TOML or JSON file of settings, as `litho-design settings` prints it; options override it",
+        help="TOML or JSON file of settings, as printed by `litho-design settings`",
     ),
 ]
 _Set = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        help="PATH=VALUE for any setting, such as loss.efficiency_weight=0.2; repeatable. "
-        "`litho-design settings` lists all settings",
+        help="PATH=VALUE for any setting of `litho-design settings`; repeatable",
     ),
 ]
 

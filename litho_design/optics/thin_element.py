@@ -42,7 +42,7 @@ class Optics(Record):
     )
     distance_um: float = setting(
         300.0,
-        "Distance to the image plane; the focal length of a lens",
+        "Distance to the image plane, or focal length",
         unit="µm",
         option=("--distance-um", "--focal-length-um"),
         gt=0,

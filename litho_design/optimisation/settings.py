@@ -127,7 +127,7 @@ class DesignSettings(Record):
 
     variant: Variant = setting(
         "default",
-        "Preset: our own settings (default), those in the paper, or those of the authors' code",
+        "Preset: ours (default), the paper's, or that of its authors' code",
         option="--variant",
     )
     layout: LayoutSettings = setting(LayoutSettings(), "Layout")

@@ -27,7 +27,7 @@ class LayoutSettings(Record):
         le=PITCH_UM.high,
     )
     cell_um: float = setting(
-        0.4, "Side of a free cell (hologram) or width of a ring (lens)", unit="µm", option="--cell-um", gt=0
+        0.4, "Side of a free cell, or width of a ring", unit="µm", option="--cell-um", gt=0
     )
     cell_filter_um: float = setting(
         0.0,

@@ -14,6 +14,7 @@ from litho_data.commands.app import (
     new_app,
     option,
     run_app,
+    with_further_options,
 )
 from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
@@ -34,38 +35,35 @@ app.add_typer(board, name="board")
 
 ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME for a model of the package")]
 StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")]
-Out = Annotated[Path, option("folder for the result; a folder with other contents is refused")]
+Out = Annotated[Path, option("folder of the result")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
-    option("terms fitted to each scan before its error is computed; by default offset, but none for films"),
+    option("terms fitted to each scan before scoring; by default offset, for films none"),
 ]
-_BACKGROUND_HELP = "training: add the smooth background shared by the training scans to the predictions"
+_BACKGROUND_HELP = "training: add the background that the training scans share"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    option(f"{_BACKGROUND_HELP}; shared: apply the whole fitted measurement model to them"),
+    option(f"{_BACKGROUND_HELP}; shared: apply a measurement model"),
 ]
 NoiseOption = Annotated[
     Path | None,
-    option("noise.json of `litho-models noise` on this dataset; its noise floor is shown beside the errors"),
+    option("noise.json of this dataset, whose noise floor is shown"),
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    option("training recipe: fast takes minutes; paper takes 4,000 epochs with the optimiser Adam"),
+    option("training: fast takes minutes, paper 4,000 epochs"),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
-    option(
-        "settings of the model: default (those of this package), paper (as printed in the paper) or authors "
-        "(as in the code of its authors)"
-    ),
+    option("settings of the model: ours (default), those of the paper, or those of its authors' code"),
 ]
-Steps = Annotated[int | None, option("number of optimiser steps; by default that of the recipe", min=1)]
+Steps = Annotated[int | None, option("optimiser steps; by default those of the recipe", min=1)]
 Seed = Annotated[int, option("seed of the initial weights and of the splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
-        "setting FIELD=VALUE of the training or the model, such as learning_rate=0.001; repeatable",
+        "FIELD=VALUE of training or model, such as learning_rate=0.001; repeatable",
         "--set",
     ),
 ]
@@ -113,6 +111,7 @@ def train(
 
 
 @app.command()
+@with_further_options
 @with_paper_copies
 def evaluate(
     model: ModelName,
@@ -155,13 +154,14 @@ def evaluate(
 
 
 @app.command()
+@with_further_options
 @with_paper_copies
 def benchmark(
     store: StorePath,
     out: Out,
     split: Annotated[
         Literal["grouped", "paper", "leave-one-print-out"],
-        option("what is held out in each fold: a group of scans, random quadrants, or a whole print"),
+        option("what each fold holds out: scans, random quadrants, or a print"),
     ] = "grouped",
     models: Annotated[str | None, option("names of models, separated by commas; by default all")] = None,
     recipe: RecipeOption = "fast",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 import litho_models
-from litho_data.commands.app import DaskOption, WorkersOption, argument, option
+from litho_data.commands.app import DaskOption, WorkersOption, argument, option, with_further_options
 from litho_data.commands.progress import say
 from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
@@ -20,6 +20,7 @@ FreeOption = Annotated[
 ]
 
 
+@with_further_options
 @with_paper_copies
 def close_loop(
     stores: Annotated[
