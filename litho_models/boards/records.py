@@ -180,9 +180,7 @@ class Answer(Result):
     corrected_values: dict[str, float] = Field(default_factory=dict)
 
 
-# Older result files also contain the verdict of the loop and the name of its base model. Both entries are
-# ignored.
-class Trial(Result, extra="ignore"):
+class Trial(Result):
     """The result of one judged trial. For a failed trial, ``errors`` is None and ``failure`` says why it
     failed.
 

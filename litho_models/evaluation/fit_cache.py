@@ -30,9 +30,7 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-# Older result files have two more fields, which are ignored: the cost of a prediction, and how much a
-# prediction changes if the layout is cropped differently.
-class FitDiagnostics(Record, extra="ignore"):
+class FitDiagnostics(Record):
     """Errors of one fitted model on its training, validation and held-out scans.
 
     All three are datum-free errors with the policy ``offset`` and without a background, averaged over scans.

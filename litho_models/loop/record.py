@@ -135,8 +135,6 @@ class FoundEffect(Record):
             that looks the same.
     """
 
-    FORMER: ClassVar[frozenset[str]] = frozenset({"stage", "reshaped_share"})
-
     name: str
     title: str
     knowledge: Knowledge
@@ -278,8 +276,6 @@ class CloseLoop(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
     FILE_NAME: ClassVar[str] = "close_loop.json"
-    FORMER: ClassVar[frozenset[str]] = frozenset({"groups", "chosen", "at_bounds", "confounded"})
-
     run: RunInfo
     dataset: DatasetId
     base_model: str

@@ -39,8 +39,7 @@ class FlatLevel(Record):
     mae_nm: float
 
 
-# Older result files also contain a correlation length, which is ignored.
-class NoiseBudget(Record, extra="ignore"):
+class NoiseBudget(Record):
     """Two estimates of an upper limit of the noise of prints.
 
     ``floor`` is computed from pixels with similar surroundings (see ``floor_of_residuals``). ``flat_levels``

@@ -43,9 +43,7 @@ _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
 
 
-# Older result files also contain values for ensembles of models and bounds for whole scans, which are
-# ignored.
-class ScanCalibration(Record, extra="ignore"):
+class ScanCalibration(Record):
     """The scores of a stated spread on one scan.
 
     ``nll`` is the negative log-likelihood, and ``crps_nm`` is the continuous ranked probability score. For
@@ -65,7 +63,7 @@ class ScanCalibration(Record, extra="ignore"):
     ause: float
 
 
-class Calibration(Record, extra="ignore"):
+class Calibration(Record):
     """The calibration of one model of the spread, on prints that were not used to fit it.
 
     Args:
@@ -90,7 +88,7 @@ class Calibration(Record, extra="ignore"):
     ause: float
 
 
-class SigmaBin(Record, extra="ignore"):
+class SigmaBin(Record):
     """Results for the pixels at which a covariate lies in a given range: the measured and the predicted
     spread of the residual, and the coverage of the stated intervals.
 
@@ -112,7 +110,7 @@ class SigmaBin(Record, extra="ignore"):
     ause: float
 
 
-class SpreadAnalysis(Record, extra="ignore"):
+class SpreadAnalysis(Record):
     """The spread σ(x) of the residuals of one model, and its calibration. ``bins`` is computed on scans that
     were not used to fit the spread. ``variance`` is the model of the spread, fitted to all scans.
 

@@ -41,7 +41,7 @@ class LevelHeight(Record):
     pixels: int
 
 
-class DoseRow(Record, extra="ignore"):
+class DoseRow(Record):
     """The results at one dose.
 
     Args:

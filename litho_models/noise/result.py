@@ -15,7 +15,7 @@ from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
 from litho_models.scoring.statistics import rms
 
 
-class NoiseAnalysis(Result, extra="ignore"):
+class NoiseAnalysis(Result):
     """The content of ``noise.json``."""
 
     SCHEMA = "litho-models/noise/1"

@@ -27,7 +27,7 @@ _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
 
-class Step(Record, extra="ignore"):
+class Step(Record):
     """One step of a staircase. Heights are in nm.
 
     Args:
@@ -44,7 +44,7 @@ class Step(Record, extra="ignore"):
     misread: float
 
 
-class StepPrint(Record, extra="ignore"):
+class StepPrint(Record):
     """The results from a print of steps.
 
     Args:

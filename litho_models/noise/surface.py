@@ -20,7 +20,7 @@ BACKGROUNDS: dict[Background, Terms] = {
 }
 
 
-class SurfaceNoise(Record, extra="ignore"):
+class SurfaceNoise(Record):
     """The roughness of a surface: how far its heights deviate from its smooth background.
 
     Args:
@@ -42,7 +42,7 @@ class SurfaceNoise(Record, extra="ignore"):
     pixels: int
 
 
-class PrintNoise(Record, extra="ignore"):
+class PrintNoise(Record):
     """The roughness that a print adds to the substrate, nm. Its square is the squared roughness of the flat
     print minus the squared roughness of the substrate: ``print² = flat² − substrate²``.
 

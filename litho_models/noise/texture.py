@@ -16,7 +16,7 @@ from litho_data.roughness import line_direction, line_period
 RARE = 1e-3
 
 
-class Period(Record, extra="ignore"):
+class Period(Record):
     """The strongest period with which lines repeat.
 
     Args:

@@ -87,10 +87,6 @@ class NextPrint(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
     FILE_NAME: ClassVar[str] = "plan.json"
-    FORMER: ClassVar[frozenset[str]] = frozenset(
-        {"smallest_feature_um", "level_distance", "starts", "cutoff_per_um"}
-    )
-
     run: RunInfo
     dataset: DatasetId
     settings: dict[str, Any]

@@ -46,13 +46,12 @@ class NoiseFloor(Record):
 
     ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error for the
     policy ``offset``, i.e. after an offset is fitted to each scan. ``by_policy`` contains the floors for each
-    policy. It is empty if only the floor for the policy ``offset`` is known, and in older result files. The
-    kinds ``lower-bound`` and ``literature`` occur only in older files.
+    policy. It is empty if only the floor for the policy ``offset`` is known.
     """
 
     mae_nm: float | None
     rmse_nm: float | None
-    kind: Literal["measured", "upper-estimate", "lower-bound", "literature", "unknown"]
+    kind: Literal["measured", "upper-estimate", "unknown"]
     source: str
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 

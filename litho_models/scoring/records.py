@@ -70,7 +70,7 @@ class MetricValues(Record):
 
     ``ssim`` is explained at ``structural_similarity``, and the metrics of edges at ``EdgePlacement``. All
     other metrics are in ``metrics``; their keys contain name and unit. A metric is None if the scan contained
-    nothing to compare, or if the result file was written before the metric existed.
+    nothing to compare.
     """
 
     ssim: float | None = None
@@ -86,8 +86,7 @@ class MetricValues(Record):
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-# Older result files also contain the standard error of the intercept, which is ignored.
-class ScanErrors(Record, extra="ignore"):
+class ScanErrors(Record):
     """The errors of one model on one scan, over the scored pixels.
 
     ``mae_abs_nm`` and ``bias_nm`` (measured minus predicted) are computed with nothing fitted to the scan.
@@ -115,8 +114,7 @@ class ScanRow(MetricValues, ScanErrors):
     print: str
 
 
-# Older result files also contain the spread of the line offsets, which is ignored.
-class ModelScores(MetricValues, extra="ignore"):
+class ModelScores(MetricValues):
     """All scores of one model. Errors are means over scans, counts are sums over scans, and confidence
     intervals come from resampling scans.
 
@@ -170,7 +168,7 @@ class Paired(Record):
     model is better. ``first_better`` counts the scans in which the first model is better.
 
     ``over_prints`` is the same comparison with prints instead of scans as independent units. ``over_prints``
-    is None if there is only one print, and in older result files.
+    is None if there is only one print.
     """
 
     first: str

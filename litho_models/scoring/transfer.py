@@ -27,7 +27,7 @@ class LevelError(Record):
     sd_nm: float
 
 
-class TransferCurves(Record, extra="ignore"):
+class TransferCurves(Record):
     """A comparison of the spectra of the predicted height H and the measured height Z, along x and along y.
     It states the gain |H·Z*| / |Z|² and the coherence γ² at each frequency.
 
