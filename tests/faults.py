@@ -129,8 +129,8 @@ FAULTS = [
     Fault("shared terms learned from the scan itself", "litho_models/loop/closing.py",
           "for own, held_out in study.folds:", "for own, held_out in [(list(range(len(scans))),) * 2]:",
           f"{RUN} -k others_say"),
-    Fault("a choice made with the print that is judged", "litho_models/loop/run.py",
-          "close_again([scan for scan in scans if scan.id not in out])", "close_again(scans)",
+    Fault("a choice made with the print that is judged", "litho_models/loop/errors.py",
+          "close_again(used)", "close_again(scans)",
           f"{RUN} -k judged_on"),
     # Reports.
     Fault("a coverage stands under another level", "litho_models/noise/report.py",

@@ -1,9 +1,12 @@
-"""Check that every typical mistake of a user is answered in one line that says what to do."""
+"""Check that every typical mistake of a user is answered in one line that says what to do. Check also that
+the faults of ``tests/faults.py`` can still be put into the code.
+"""
 
 from __future__ import annotations
 
 import pytest
 
+from tests.faults import FAULTS, ROOT
 from tests.mistakes import MISTAKES, answer, world
 
 ALL = [(did, mistake) for mistakes in MISTAKES.values() for did, mistake in mistakes.items()]
@@ -31,3 +34,8 @@ def test_a_mistake_is_answered_in_one_line(did, mistake, files):
     assert any(word in last for word in ("wanted", ";", ": no ")), last
     assert not any(word in last for word in ("Errno", "PosixPath", "Traceback", "codec")), last
     assert sorted(path.name for path in files.iterdir()) == before
+
+
+def test_the_right_text_of_every_fault_stands_once_in_its_file():
+    found = {fault.name: (ROOT / fault.file).read_text("utf-8").count(fault.right) for fault in FAULTS}
+    assert {name: count for name, count in found.items() if count != 1} == {}
