@@ -176,6 +176,27 @@ def test_the_help_of_every_command_fits_one_screen() -> None:
     assert max(len(line) for lines in helps.values() for line in lines) <= 80
 
 
+@pytest.mark.parametrize(
+    ("program", "command", "headings"),
+    [
+        ("models", "noise", ["Arguments", "Options"]),
+        ("models", "benchmark", ["Arguments", "Options", "Where it runs"]),
+        ("design", "hoe", ["Options", "Where it runs", "Layout", "Optics", "Search"]),
+    ],
+)
+def test_a_help_has_headings_and_leaves_the_rest_to_help_all(
+    program: str, command: str, headings: list[str]
+) -> None:
+    app = importlib.import_module(f"litho_{program}.cli.app").app
+    said = CliRunner().invoke(app, [command, "--help"]).output
+    assert re.findall(r"^([A-Z][\w ]*):$", said, re.MULTILINE) == headings
+    if "--help-all" in said:
+        more = CliRunner().invoke(app, [command, "--help-all"]).output
+        hidden = {"benchmark": "--figures", "hoe": "--band-px"}[command]
+        assert hidden in more
+        assert hidden not in said
+
+
 def commands_of(command: Any, *words: str) -> Iterator[tuple[str, ...]]:
     """Return the words that call each command of a program, the program itself included."""
     yield words

@@ -34,12 +34,18 @@ def argument(help: str) -> Any:
     return typer.Argument(help=help)
 
 
-# The heading under which the help lists options that change how a result is computed, but not the result.
-COMPUTING = "Computing"
+# The heading under which the help lists options that say where a result is computed.
+COMPUTING = "Where it runs"
 _CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
 _LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
 WorkersOption = Annotated[
-    int, option("number of local processes", "--workers", min=1, rich_help_panel=COMPUTING)
+    int,
+    option(
+        "number of local processes",
+        "--workers",
+        min=1,
+        rich_help_panel=COMPUTING,
+    ),
 ]
 DaskOption = Annotated[
     str | None,
@@ -126,14 +132,15 @@ class _Command(typer.core.TyperCommand):
 
     def format_options(self, context: Any, formatter: Any) -> None:
         """Write the arguments and the visible options into the help, each under its heading."""
-        found: dict[str, list[Any]] = {}
+        found: dict[str, list[Any]] = {"Arguments": [], "Options": []}
         for one in self.get_params(context):
             usual = "Arguments" if one.param_type_name == "argument" else "Options"
             if record := one.get_help_record(context):
                 found.setdefault(getattr(one, "rich_help_panel", None) or usual, []).append(record)
         for heading, records in found.items():
-            with formatter.section(heading):
-                formatter.write_dl(records)
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
 
 
 class _App(typer.Typer):

@@ -19,7 +19,8 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 class Record(BaseModel):
     """Base class of immutable records. Result files consist of such records. Unknown keys are errors. The
-    keys listed in ``FORMER`` occur only in older files and are ignored.
+    keys listed in ``FORMER`` occur only in older files and are ignored. Such keys are kept for stores, frozen
+    models and designs, which stay readable. Results of analyses are computed again.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset()

@@ -57,7 +57,7 @@ Judges = Annotated[
     list[str] | None,
     typer.Option(
         "--judge",
-        help="MODEL or NAME=MODEL that judges the design; by default all of this printer in the zoo",
+        help="MODEL or NAME=MODEL that judges; repeatable; by default the zoo's models of this printer",
     ),
 ]
 Robust = Annotated[
@@ -147,7 +147,9 @@ def correct(
     scan: MeasuredSource | None,
     after: Annotated[
         Path | None,
-        typer.Option(help="folder of a correction that was printed and measured, whose error is subtracted"),
+        typer.Option(
+            help="folder of a printed and measured correction; its error is subtracted from the target"
+        ),
     ] = None,
     spread_of: SpreadOf = None,
     judge: Judges = None,

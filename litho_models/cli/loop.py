@@ -168,7 +168,9 @@ def next_print(
         Path,
         option("folder for the plan: dataset card, layouts, table of scans, instruction sheets and report"),
     ],
-    prints: Annotated[int, option("number of prints to plan, not counting reference prints", min=1)] = 4,
+    prints: Annotated[
+        int, option("number of prints to plan, not counting reference prints", min=1, max=12)
+    ] = 4,
     field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
         Literal["optimised", "random"],

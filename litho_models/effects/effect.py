@@ -112,7 +112,7 @@ class FieldContext:
     @cached_property
     def exposed_slices(self) -> Tensor:
         """Return the exposure of each slice, blurred by the spot, where 1 means fully exposed. The result has
-        shape (slices, 1, ny, nx).
+        shape (slices, 1, ny, nx). It is used by the effect ``layer-stacking``, once per scan.
         """
         count = max(1, round(self.full_height_um / self.slice_um))
         # The dose changes the exposure, not the number of slices.
@@ -315,7 +315,15 @@ class Effect:
         return torch.rot90(seen, -turn, (-2, -1))
 
 
-def entry(title: str, parameters: Mapping[str, Parameter], **facts: Any) -> Callable[[Apply], Effect]:
+def entry(
+    title: str,
+    parameters: Mapping[str, Parameter],
+    *,
+    stage: Stage,
+    role: Role,
+    acts_on: ActsOn,
+    **facts: Any,
+) -> Callable[[Apply], Effect]:
     """Make a decorator that turns a formula (a function of the type ``Apply``) into an effect. The effect
     gets the name of the function, with hyphens instead of underscores. ``facts`` sets the other fields of
     ``Effect``.
@@ -323,7 +331,7 @@ def entry(title: str, parameters: Mapping[str, Parameter], **facts: Any) -> Call
 
     def of_formula(apply: Apply) -> Effect:
         name = apply.__name__.replace("_", "-")
-        return Effect(name=name, title=title, parameters=parameters, apply=apply, **facts)
+        return Effect(name, title, stage, role, acts_on, parameters, apply, **facts)
 
     return of_formula
 

@@ -170,13 +170,13 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     depletion, and the kernel K_l is a one-sided exponential of length l along the slow axis.
     """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
-    pitch, axis = context.pitch_um, "yx".index(context.slow_axis)
-    starved = add_filtered(
-        layout,
-        lambda *f: -strength * trailing_response(direction * f[axis], length, pitch),
-        pitch,
-        _TAIL_LENGTHS * float(length.detach()),
-    )
+    pitch = context.pitch_um
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        along = fy if context.slow_axis == "y" else fx
+        return -strength * trailing_response(direction * along, length, pitch)
+
+    starved = add_filtered(layout, transfer_minus_one, pitch, _TAIL_LENGTHS * float(length.detach()))
     # Where another effect has already made the dose negative, the dose is not reduced further.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)

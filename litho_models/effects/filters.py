@@ -63,18 +63,19 @@ def add_blur(field: Tensor, variance_um2: Tensor | float, pitch_um: float, reach
     )
 
 
-def local_mean(field: Tensor, length_um: Tensor, pitch_um: float, reach: float = 3.0) -> Tensor:
+def local_mean(field: Tensor, length: Tensor, pitch: float, reach: float = 3.0) -> Tensor:
     """Return the mean of a field around each pixel. The mean has Gaussian weights with standard deviation
-    ``length_um``, and reaches to ``reach`` standard deviations.
+    ``length``, and reaches to ``reach`` standard deviations. Length and pitch have the same unit.
     """
-    return add_blur(field, length_um**2, pitch_um, reach * float(length_um.detach()))
+    return add_blur(field, length**2, pitch, reach * float(length.detach()))
 
 
-def add_scattered(layout: Tensor, weight: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
+def add_scattered(layout: Tensor, weight: Tensor, length: Tensor, pitch: float) -> Tensor:
     """Add the dose that leaks in from the neighbourhood of each pixel: D = (M + η G_b * M) / (1 + η), where η
-    is the weight of this dose, G_b is a Gaussian of standard deviation b, and * is convolution.
+    is the weight of this dose, G_b is a Gaussian of standard deviation b, and * is convolution. The length b
+    and the pitch have the same unit.
     """
-    return layout + weight / (1 + weight) * (local_mean(layout, length_um, pitch_um) - layout)
+    return layout + weight / (1 + weight) * (local_mean(layout, length, pitch) - layout)
 
 
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
@@ -83,7 +84,7 @@ def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> 
 
     T is an analytic function of l, and T = 1 at l = 0. For small pixels, T approaches 1 / (1 + i 2π f l).
     """
-    # T = 1 / (1 + a (1 - e^(-iθ))) in real numbers, which takes a tenth of the time of complex ones.
+    # T = 1 / (1 + l/dx (1 - e^(-2i half))). Real numbers take a quarter of the time of complex ones.
     pixels, half = length_um / pitch_um, math.pi * pitch_um * frequency
     sine = half.sin()
     real, imaginary = 1 + 2 * pixels * sine**2, 2 * pixels * sine * half.cos()

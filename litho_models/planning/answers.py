@@ -114,7 +114,7 @@ def surely_better(
     return max(gain - max(unknown, seen), 0.0) / sd
 
 
-# Numbers of prints for which the power is computed.
+# Numbers of prints that can be planned. The power is computed for each of them.
 COUNTS = range(1, 13)
 # Number of times that the parameters of the rivals are drawn at random within their uncertainty. The power is
 # averaged over these draws, because the difference between two rivals may depend on the parameters.

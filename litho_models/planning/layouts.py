@@ -252,7 +252,9 @@ def choose(rivalry: Rivalry, level: np.ndarray, plain: FieldContext) -> Chosen:
         if not _worth(scores[best], reached):
             break
         ways, reached = (*ways, best), scores[best]
-    at_edge = plain.radius_um() > max(plain.layout_um.shape) * plain.pitch_um / 2
+    # A print that fills the write field, to within a pixel, cannot be moved.
+    size_px = max(plain.layout_um.shape[-2:])
+    at_edge = 2 * (plain.field_radius_um or 0.0) > (size_px + 1) * plain.pitch_um
     if at_edge:
         tried["at the edge of the write field"] = there = separation(ways, at_edge)
         at_edge = _worth(there, reached)
@@ -278,7 +280,7 @@ def _worth(more: float, reached: float) -> bool:
 def climbed(
     rivalries: Sequence[Rivalry],
     chosen: Chosen,
-    begun: Mapping[str, np.ndarray],
+    starting: Mapping[str, np.ndarray],
     limits: Limits,
     plain: FieldContext,
     count: int,
@@ -293,7 +295,7 @@ def climbed(
     Args:
         rivalries: the rivals of each question.
         chosen: the ways to print and scan.
-        begun: layouts from which the optimisation may start, as returned by ``starts``.
+        starting: layouts from which the optimisation may start, as returned by ``starts``.
         limits: limits for the layouts.
         plain: as for ``planned_scans``.
         count: number of tiles.
@@ -305,7 +307,7 @@ def climbed(
     kept.mkdir(parents=True, exist_ok=True)
     report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
     scans_of = partial(planned_scans, plain, ways=chosen.ways)
-    able = [one for one in begun.items() if _repeats(one[1]) <= _MOST_REPEATING]
+    able = [one for one in starting.items() if _repeats(one[1]) <= _MOST_REPEATING]
     ranked = [sorted(able, key=lambda one: -score(rivalry, [scans_of(one[1])])) for rivalry in rivalries]
     tiles = []
     for number in range(count):

@@ -55,7 +55,7 @@ def write_report(
     page = Page(
         f"What to print next: {plan.dataset.name}",
         f"{plan.prints} print{'s' * (plan.prints > 1)} with a side of {plan.field_um:g} µm, and "
-        f"{len(plan.scans)} scans, including four reference scans.",
+        f"{len(plan.scans)} scans, including those of references.",
         run=plan.run,
         facts={"dataset": plan.dataset.sha256},
         words=Path(__file__).with_name("words.toml"),

@@ -66,11 +66,13 @@ def planned_scans(
         level: levels of the layout, of shape (ny, nx). They need not be whole numbers. The scans are
             differentiable with respect to them if they are a tensor.
         ways: the ways in which the print is scanned, one per scan, as keys of ``WAYS``.
-        at_edge: whether the print lies in a corner of the write field instead of its centre.
+        at_edge: whether the print lies in a corner of the write field instead of its centre. It has no effect
+            if the width of the write field is not known.
         order: position in the writing order, from -0.5 (first) to 0.5 (last).
         dose: dose relative to earlier prints.
     """
-    reach_um = plain.radius_um() - max(level.shape) * plain.pitch_um / 2 if at_edge else 0.0
+    radius_um = plain.field_radius_um if at_edge else None
+    reach_um = 0.0 if radius_um is None else radius_um - max(level.shape) * plain.pitch_um / 2
     printed = replace(
         plain,
         layout_um=(dose * plain.slice_um * torch.as_tensor(level, dtype=torch.float32))[None, None],

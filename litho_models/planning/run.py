@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from litho_data.cards.card import Use
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
@@ -148,9 +149,11 @@ def next_print(
         cache = Path(f"{out}-cache")
         if rivalries and layouts == "optimised":
             kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
-            begun = starts(tile_px, limits, seed)
+            starting = starts(tile_px, limits, seed)
             every = [*rivalries.values()]
-            tiles = climbed(every, chosen, begun, limits, plain, count, steps=steps, kept=kept, report=report)
+            tiles = climbed(
+                every, chosen, starting, limits, plain, count, steps=steps, kept=kept, report=report
+            )
         else:
             tiles = [limits.random(tile_px, seed + 31 + i) for i in range(count)]
         levels = [assemble(tiles, number, size_px, limits) for number in range(prints)]
@@ -195,18 +198,22 @@ def schedule(
     seed: int,
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
     """Return the planned scans, which are the rows of the table ``scans.csv``, and the level map of each
-    scan. The scans of the four references (substrate, flat, steps and grating) come first.
+    scan. The scans of the references (substrate, flat, steps and grating) come first. Without room or levels
+    for three steps, there is no reference with steps.
     """
-    size_px = len(levels[0])
-    # A staircase looks the same when it is shifted, so its position could not be determined. It is therefore
-    # surrounded by a random frame if there is room for three steps.
-    ladder = limits.random(size_px, seed + 13)
-    if size_px >= _LADDER_PX and limits.highest - limits.lowest > 1:
-        ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
+    size_px, lowest, highest = len(levels[0]), limits.lowest, limits.highest
     unprinted = flat((size_px, size_px), level=0)
-    middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)
-    references = [unprinted, middle, ladder, unprinted]
-    groups = [[(use, plain, why) for use, why in _REFERENCES.items()]]
+    references: dict[Use, np.ndarray] = {
+        "substrate": unprinted,
+        "flat": flat((size_px, size_px), level=(lowest + highest) // 2),
+    }
+    if size_px >= _LADDER_PX and highest - lowest > 1:
+        # A staircase looks the same when it is shifted, so its position could not be determined. It is
+        # therefore surrounded by a random frame.
+        frame = limits.random(size_px, seed + 13)
+        references["steps"] = framed_ladder(frame, highest=highest, lowest=lowest, tread_px=_TREAD_PX)
+    references["grating"] = unprinted
+    groups = [[(use, plain, _REFERENCES[use]) for use in references]]
     groups += [[("dataset", *one) for one in zip(own, ways, strict=True)] for own in planned]
     scans: list[PlannedScan] = []
     for number, group in enumerate(groups):
@@ -228,7 +235,7 @@ def schedule(
                     why=why + f"; the print has {scan.dose:g} of the dose" * (scan.dose != 1),
                 )
             )
-    return scans, [*references, *(level for level in levels for _ in ways)]
+    return scans, [*references.values(), *(level for level in levels for _ in ways)]
 
 
 def write_plan(

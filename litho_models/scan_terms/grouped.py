@@ -226,11 +226,12 @@ class Products:
         """
         if not blocks:
             return []
+        # Scans with the same labels in the groupings of all blocks have the same unknowns.
         alike: dict[Labels, list[int]] = {}
         for scan in scans:
             alike.setdefault(tuple(self.groups[block.by][scan] for block in blocks), []).append(scan)
         usual = np.einsum("sii->si", self.grams)[scans].sum(axis=0) / max(len(scans), 1)
-        rows: list[Strengths] = [{} for _ in blocks]
+        rows: list[dict[str, np.ndarray]] = [{} for _ in blocks]
         shrunk: list[float] = []
         for number, (own, block) in enumerate(zip(rows, blocks, strict=True)):
             for label in sorted({labels[number] for labels in alike}):

@@ -28,6 +28,7 @@ from litho_models.scan_terms.term import FloatMap
 
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
+# The displacements, in the order of the axes.
 _SHIFTS = ("shift-y", "shift-x")
 
 # Surfaces that the microscope software may have fitted to whole scan files and subtracted from them. Each

@@ -13,6 +13,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
@@ -434,8 +435,9 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     jobs = {job.id: job for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=5)}
     assert jobs["N1F2"].turned_deg == 90
     assert jobs["N1F1"].printed == jobs["N1F2"].printed != jobs["N2F1"].printed
-    references = [jobs[f"N0F{n}"] for n in (1, 2, 3, 4)]
-    assert [one.use for one in references] == ["substrate", "flat", "steps", "grating"]
+    # A staircase has no room in 64 px.
+    references = [jobs[f"N0F{n}"] for n in (1, 2, 3)]
+    assert [one.use for one in references] == ["substrate", "flat", "grating"]
     assert references[-1].grating_um == 1.0
     assert (tmp_path / "plan" / "microscope.md").read_text("utf-8").count("90°") >= 2
     assert not (tmp_path / "plan-cache").exists()
@@ -508,13 +510,22 @@ def test_numbers_and_sizes_of_prints_that_cannot_be_planned_are_refused(
         next_print(loop, tmp_path / "plan", prints=prints, field_um=field_um)
 
 
-def test_a_printer_with_two_usable_levels_gets_no_staircase(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("levels", "steps"), [((5, 6), []), ((5, 6, 7), ["steps"])])
+def test_a_staircase_needs_three_usable_levels(
+    levels: Sequence[int], steps: list[str], tmp_path: Path
+) -> None:
     loop = closed_loop(tmp_path / "loop", [slope_question()])
-    two = [0.5 * (level in (5, 6)) for level in range(13)]
-    opened([slope_question()]).model_copy(update={"level_share": two}).write(loop)
-    plan = next_print(loop, tmp_path / "plan", prints=2, field_um=30.0, steps=1)
+    share = [(level in levels) / len(levels) for level in range(13)]
+    opened([slope_question()]).model_copy(update={"level_share": share}).write(loop)
+    plan = next_print(loop, tmp_path / "plan", prints=2, field_um=30.0, steps=0, layouts="random")
     assert plan is not None
-    assert plan.levels == (5, 6)
+    assert plan.levels == (levels[0], levels[-1])
+    assert [one.use for one in plan.scans if one.print == "0"] == ["substrate", "flat", *steps, "grating"]
+    # Each reference with steps shows steps, which the noise analysis needs.
+    for one in plan.scans:
+        if one.use == "steps":
+            layout = tifffile.imread(tmp_path / "plan" / "layouts" / f"{one.id}.tif")
+            assert {*np.unique(layout[75])} >= {*levels}
 
 
 def test_the_page_quotes_the_plan_for_the_measured_prints() -> None:
