@@ -10,16 +10,17 @@ from operator import call
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import nn
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
-from litho_data.sharing.workers import HERE, Workers, run_jobs
+from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
-from litho_models.fitting import TrainingConfig, fit_in_cache
+from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
+from litho_models.frozen.card import ModelCard
+from litho_models.frozen.files import load_simulator
 from litho_models.loop.fits import Study
 from litho_models.loop.model import FoldedBase
 from litho_models.loop.prepared import exposed
@@ -27,9 +28,6 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
-# A function that trains a model on the given scans. The function must be picklable, because it is sent to
-# other processes.
-Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 # Base models from which the loop chooses one by default. The first of them has the same form as the Physics
 # model of the paper.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
@@ -73,8 +71,7 @@ def bases_for(
         return {base: named}
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     recipe = TrainingConfig.of_recipe("fast", base, film=study.of_films, seed=study.seed, **given)
-    trainer = partial(_trained, base, recipe, cache)
-    return {base: train_folds(scans, study.fold_of, trainer, study.workers)}
+    return {base: train_folds(study, partial(fit_in_cache, base, config=recipe, cache=cache))}
 
 
 def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simulator:
@@ -82,14 +79,7 @@ def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simu
     return build_model(name, **common_geometry([scan]), **{**usual, **fields})
 
 
-def _trained(base: str, settings: TrainingConfig, cache: Path, scans: Sequence[PrintedScan]) -> nn.Module:
-    return fit_in_cache(base, scans, settings, cache).model
-
-
 def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
-    from litho_models.frozen.card import ModelCard
-    from litho_models.frozen.files import load_simulator
-
     folder = zoo.model_folder(base, other=[AUTO, *MODELS])
     card = ModelCard.read(folder)
     if abs(card.pitch_um - pitch_um) > 1e-9:
@@ -98,24 +88,21 @@ def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
     return {card.name: load_simulator(folder, card)}
 
 
-def train_folds(
-    scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
-) -> FoldedBase:
+def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]) -> FoldedBase:
     """Train one model for each fold on the scans outside this fold, and one model on all scans. Before the
     training, each layout is multiplied by the dose of its scan, as for all predictions of the loop.
 
     Args:
-        scans: the scans.
-        fold_of: number of the fold of each scan, of shape (scans,).
-        trainer: function that trains a model on the scans that it receives.
-        workers: pool of processes.
+        study: the scans with their folds, and the workers.
+        trainer: function that trains a model on the scans that it receives. It must be picklable, because it
+            is sent to other processes.
     """
-    fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
-    count = max(fold.values()) + 1
+    seen = [exposed(scan) for scan in study.stored]
     # The last model is trained on all scans.
-    seen = [exposed(scan) for scan in scans]
-    jobs = [partial(trainer, [one for one in seen if fold[one.id] != out]) for out in range(count + 1)]
-    done = run_jobs(call, jobs, workers, name=lambda job: f"fold {jobs.index(job)}")
+    parts = [*([seen[i] for i in rest] for rest, _ in study.folds), seen]
+    jobs = [partial(trainer, part) for part in parts]
+    done = run_jobs(call, jobs, study.workers, name=lambda job: f"fold {jobs.index(job)}")
     trained = dict(progress(done, "training the base model", len(jobs)))
-    *models, common = (trained[job] for job in jobs)
-    return FoldedBase(models, fold, common)
+    *models, common = (trained[job].model for job in jobs)
+    fold_of = dict(zip((scan.id for scan in seen), study.fold_of.tolist(), strict=True))
+    return FoldedBase(models, fold_of, common)

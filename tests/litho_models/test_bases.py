@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from litho_data.store import PrintedScan
 from litho_data.store.printed_scan import scan_sha256
 from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
+from litho_models.fitting import Fitted
 from litho_models.frozen.card import ModelCard
 from litho_models.loop.bases import bases_for, train_folds
 from litho_models.loop.closing import close
@@ -71,10 +74,14 @@ def trained(scans: Sequence[PrintedScan]) -> Simulator:
     return model
 
 
-def bases_of(scans: Sequence[PrintedScan], study: Study) -> dict[str, nn.Module]:
+def fitted(scans: Sequence[PrintedScan]) -> Fitted:
+    return cast(Fitted, SimpleNamespace(model=trained(scans)))
+
+
+def bases_of(study: Study) -> dict[str, nn.Module]:
     return {
         "fitted here": base_model(),
-        "trained per fold": train_folds(scans, study.fold_of, trained),
+        "trained per fold": train_folds(study, fitted),
     }
 
 
@@ -92,7 +99,7 @@ def test_no_height_of_a_held_out_scan_changes_its_prediction(
     other = [s.height_um + 0.2 * s.layout_um**2 if i in out else s.height_um for i, s in enumerate(scans)]
     maps, fitted = [], []
     for own in (scans, with_heights(scans, other)):
-        closed = close(study_of(own), {base: bases_of(own, study)[base]})
+        closed = close(study_of(own), {base: bases_of(study_of(own))[base]})
         # Add a law to the model, so that its strength is fitted too.
         state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
         fitted.append(state.per_fold[1].vector)
@@ -106,7 +113,7 @@ def test_no_height_of_a_held_out_scan_changes_its_prediction(
 def test_a_network_is_trained_without_each_fold_and_once_on_all() -> None:
     scans = planted(count=6)
     study = study_of(scans)
-    model = bases_of(scans, study)["trained per fold"]
+    model = bases_of(study)["trained per fold"]
     assert isinstance(model, FoldedBase)
     assert len(model.models) == len(study.folds)
     assert Twin.bare(model).own == 0
@@ -126,7 +133,7 @@ def test_a_trained_base_learns_what_the_printer_does_with_an_exposure() -> None:
     study = study_of(scans)
     bare = Twin.bare(base_model())
     truth = [1.3 * bare.height(scan) + 0.01 for scan in study.scans]
-    learned = Twin.bare(train_folds(with_heights(scans, truth), study.fold_of, trained))
+    learned = Twin.bare(train_folds(study_of(with_heights(scans, truth)), fitted))
     for scan, own in zip(study.scans, truth, strict=True):
         np.testing.assert_allclose(learned.height(scan), own, atol=1e-5)
         # A fit to nominal layouts must not be taken from the cache for a fit to exposures.
