@@ -15,6 +15,7 @@ from litho_data.store import PrintedScan
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.closing import Closed
 from litho_models.loop.record import Planted
+from litho_models.scoring.statistics import rms
 
 
 def parse_planted(text: str) -> tuple[Effect, float]:
@@ -24,14 +25,13 @@ def parse_planted(text: str) -> tuple[Effect, float]:
         InputError: the text is not NAME=AMOUNT, the effect is unknown or a per-scan effect, or the amount is
             not a number or lies outside the physical range of the amplitude.
     """
-    name, separator, number = text.partition("=")
+    name, _, number = text.partition("=")
     effect = get_effect(name.strip())
     try:
         amount = float(number)
-    except ValueError:
-        amount = float("nan")
-    if not separator or not np.isfinite(amount):
-        raise InputError("--inject", got=repr(text), wanted="NAME=AMOUNT, such as vignetting=0.1")
+    except ValueError as error:
+        wanted = "NAME=AMOUNT, such as vignetting=0.1"
+        raise InputError("--inject", got=repr(text), wanted=wanted) from error
     if effect.per_scan:
         raise InputError("--inject", got=name, wanted="an effect with the same parameters in all scans")
     effect.require_in_range({effect.amplitudes[0]: amount})
@@ -52,22 +52,19 @@ def plant(
     amplitude = effect.amplitudes[0]
     values = {effect.name: effect.with_values({amplitude: amount})}
     twin = closed.base.twin
-    changed, squares = [], []
+    changed, sizes_um = [], []
     for scan in closed.given.scans:
         here = twin.height(scan)
         added = twin.height(scan, values) - here
         changed.append(replace(scan.stored, height_um=scan.stored.height_um + added.astype(np.float32)))
-        squares.append(float(np.mean(scan.freed(scan.at_sample(added), here) ** 2)))
+        sizes_um.append(rms(scan.freed(scan.at_sample(added), here)))
     again = close_again(changed)
-    causes = filter(again.needed_by_all, again.named.causes)
-    cause = next((one for one in causes if effect.name in (one.name, *one.alike)), None)
-    named = [] if cause is None else [cause.name, *cause.alike]
-    found = again.final.twin.values().get(effect.name, {}).get(amplitude)
+    sets = ([one.name, *one.alike] for one in again.named.causes if again.needed_by_all(one))
     return Planted(
         name=effect.name,
         amount=amount,
         unit=effect.parameters[amplitude].unit,
-        rms_nm=NM_PER_UM * float(np.sqrt(np.mean(squares))),
-        named=named,
-        found=found,
+        rms_nm=NM_PER_UM * rms(sizes_um),
+        named=next((names for names in sets if effect.name in names), []),
+        found=again.final.twin.values().get(effect.name, {}).get(amplitude),
     )
