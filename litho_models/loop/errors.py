@@ -4,9 +4,10 @@ and a measurement model (of the microscope) is fitted together with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from operator import call
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES, State, Study, TwinProblem
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import PreparedScan, prepared_among
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import ErrorRow, Stage
 from litho_models.scan_terms import Blocks, Policy
 from litho_models.scan_terms.background import learn_background
@@ -70,8 +71,7 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
         numbered = enumerate(zip(scans, freed, strict=True))
         windows = [replace(scan, stored=own, number=at).window for at, (scan, own) in numbered]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
-        maps = [*map(twin.height, scans)]
-        measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
+        measurement = learn_measurement(stored, [*map(twin.height, scans)], seed=seed, like=measurement)
     # Strengths of groups to which none of these scans belongs were not fitted here. Their values may be from
     # the scans that are left out, so they are replaced.
     return Fit(twin.known_from(scans), measurement)
@@ -99,13 +99,10 @@ def error_rows(
     films = scans[0].seen_by == "sem"
     freed = freed_by_policy(scans, maps_um, Blocks(seed=seed), ("none",) if films else REPORTED)
     for policy, fits in freed.items():
-        mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
-        mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
-        edges = [
-            edges_of_scan(scan, own, fit.residual_um).mean_nm
-            for scan, own, fit in zip(scans, maps_um, fits, strict=True)
-            if films
-        ]
+        left_um = [fit.residual_um for fit in fits]
+        mae_nm = [NM_PER_UM * float(np.nanmean(np.abs(left))) for left in left_um]
+        mse_um2 = [np.nanmean(left**2) for left in left_um]
+        edges = map(edges_of_scan, scans, maps_um, left_um) if films else ()
         rows.append(
             ErrorRow(
                 **terms,
@@ -113,14 +110,22 @@ def error_rows(
                 k=float(np.mean([fit.degrees_of_freedom for fit in fits])),
                 printer_numbers=numbers[0],
                 measurement_numbers=numbers[1],
-                mae_nm=float(np.mean(mae)),
-                mae_ci95_nm=interval(mae),
-                rmse_nm=float(np.sqrt(np.mean(mse))),
-                by_scan_nm=dict(zip(ids, mae, strict=True)),
-                edge_by_scan_nm=dict(zip(ids, edges, strict=films)),
+                mae_nm=float(np.mean(mae_nm)),
+                mae_ci95_nm=interval(mae_nm),
+                rmse_nm=NM_PER_UM * float(np.sqrt(np.mean(mse_um2))),
+                by_scan_nm=dict(zip(ids, mae_nm, strict=True)),
+                edge_by_scan_nm={name: one.mean_nm for name, one in zip(ids, edges, strict=films)},
             )
         )
     return rows
+
+
+def parted(study: Study, by: Nested) -> Study:
+    """Return the study with its own folds (``folds``), or with one fold per print (``prints``)."""
+    if by == "folds":
+        return study
+    _, number = np.unique([scan.print_id for scan in study.stored], return_inverse=True)
+    return replace(study, fold_of=number)
 
 
 class HeldOut:
@@ -133,7 +138,7 @@ class HeldOut:
 
     def __init__(self, study: Study):
         self.study, self.scans = study, study.stored
-        self._by_fold, self.fit = cache(self._without_folds), cache(self._to_all)
+        self._by_fold, self.fit = cache(self._predicted), cache(self._to_all)
 
     def errors(self, closed: Closed) -> list[ErrorRow]:
         """Return the errors of three models of a loop: the base model, the base model with the causes, and
@@ -144,23 +149,22 @@ class HeldOut:
         several times, the base model and the corrected model are scored a second time. In this second score,
         each scan is predicted by a fit that leaves out all scans of the same print.
         """
-        plain, causes = closed.plain, closed.named.state
-        numbers = len(plain.twin.vector)
-        maps = plain.maps_um(self.study.scans)
-        rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
-        if not self.study.of_films:
+        study, plain, causes = self.study, closed.plain, closed.named.state
+        maps, numbers = plain.maps_um(study.scans), len(plain.twin.vector)
+        rows = self._rows(maps, (numbers, 0), model="base", measurement="print alone")
+        if not study.of_films:
             # A smooth background has five coefficients.
-            rows += self._rows(self._published(plain, maps), (numbers, 5), "base", measurement="published")
+            maps = self._published(plain, maps)
+            rows += self._rows(maps, (numbers, 5), model="base", measurement="published")
         for name, state in {"base": closed.base, "causes": causes, **closed.ends}.items():
             if name != "causes" or causes not in closed.ends.values():
-                self.study.report(f"scoring the model: {name}")
-                rows += self._rows(*self._by_fold(state), name)
-        prints = [scan.print_id for scan in self.scans]
-        if 1 < len(set(prints)) < len(prints) and closed.base.twin.own:
+                study.report(f"scoring the model: {name}")
+                rows += self._rows(*self._by_fold(state), model=name)
+        prints = len(parted(study, "prints").folds)
+        if 1 < prints < len(study.scans) and closed.base.twin.own:
             for name, state in closed.ends.items():
-                self.study.report(f"leaving out whole prints: {name}")
-                starts = dict.fromkeys(sorted(set(prints)), state.twin)
-                rows += self._rows(*self._without_parts(starts, prints), name, held_out="prints")
+                study.report(f"leaving out whole prints: {name}")
+                rows += self._rows(*self._predicted(state, by="prints"), model=name, held_out="prints")
         return rows
 
     def maps_um(self, state: State) -> Maps:
@@ -180,7 +184,7 @@ class HeldOut:
 
         @cache
         def error_nm(state: State) -> float:
-            rows = self._rows(*self._by_fold(state, refit=False), "all")
+            rows = self._rows(*self._by_fold(state, refit=False), model="all")
             return next(row.leading_nm for row in rows if row.is_headline)
 
         found, model = {}, closed.final
@@ -189,50 +193,46 @@ class HeldOut:
             found[name] = error_nm(model.without(name)) - error_nm(model)
         return found
 
-    def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
-        return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)
+    def _rows(self, maps: Maps, numbers: tuple[int, int], **terms: str) -> list[ErrorRow]:
+        return error_rows(self.scans, maps, numbers, self.study.seed, **terms)
 
     def _to_all(self, state: State) -> Fit:
         return fit_with_measurement(state.twin, self.study.scans, self.study.seed)
 
-    def _without_folds(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
-        return self._without_parts(dict(enumerate(state.per_fold)), self.study.fold_of.tolist(), refit)
-
-    def _without_parts(
-        self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
+    def _predicted(
+        self, state: State, refit: bool = True, by: Nested = "folds"
     ) -> tuple[Maps, tuple[int, int]]:
-        """Predict each scan by a fit to the scans of all other parts (folds or prints). Return the predicted
-        maps, and the numbers of parameters of the printer model and the measurement model in the largest fit.
+        """Predict each scan by a fit to the scans outside its fold (or to the scans of all other prints).
+        Return the predicted maps, and the numbers of parameters of the printer model and the measurement
+        model in the largest fit.
 
         Args:
-            starts: for each part, the model from which the fit without this part starts.
-            part_of: for each scan, the part to which it belongs.
+            state: the model from which the fits start.
             refit: whether the model of the printer is fitted again.
+            by: whether folds or prints are left out.
         """
-        scans, jobs = self.study.scans, []
-        for part, twin in starts.items():
-            rest = [scan for scan, own in zip(scans, part_of, strict=True) if own != part]
-            jobs.append((part, twin, rest, self.study.seed, refit))
-        done = run_jobs(_fit_part, jobs, self.study.workers, name=lambda job: f"part {job[0]}")
-        fits = {job[0]: fit for job, fit in done}
-        maps = [fits[part].expected_um(scan) for scan, part in zip(scans, part_of, strict=True)]
-        return maps, max(fit.numbers for fit in fits.values())
+        study = parted(self.study, by)
+        starts = state.per_fold if by == "folds" else [state.twin] * len(study.folds)
+        jobs = [
+            partial(fit_with_measurement, twin, [study.scans[i] for i in rest], study.seed, refit)
+            for twin, (rest, _) in zip(starts, study.folds, strict=True)
+        ]
+        done = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by} {jobs.index(job)}"))
+        fits = [done[job] for job in jobs]
+        pairs = zip(study.scans, study.fold_of, strict=True)
+        return [fits[fold].expected_um(scan) for scan, fold in pairs], max(fit.numbers for fit in fits)
 
     def _published(self, plain: State, maps: Maps) -> Maps:
         """Add to each predicted map a smooth background, which is learned from the scans of the other folds.
         The benchmark predicts measured maps in the same way.
         """
-        found = list(maps)
+        found, scans = list(maps), self.study.scans
         for twin, (rest, own) in zip(plain.per_fold, self.study.folds, strict=True):
-            heights = [twin.height(self.study.scans[i]) for i in rest]
-            learned = learn_background([self.scans[i] for i in rest], heights)
+            known = [scans[i] for i in rest]
+            learned = learn_background([scan.stored for scan in known], [*map(twin.height, known)])
             for i in own:
-                found[i] = maps[i] + learned.of_scan(self.scans[i])
+                found[i] = maps[i] + learned.of_scan(scans[i].stored)
         return found
-
-
-def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, bool]) -> Fit:
-    return fit_with_measurement(*job[1:])
 
 
 def errors_of_others(
@@ -253,15 +253,15 @@ def errors_of_others(
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))
     for models, closed, out in found:
-        prepared = prepared_among(out, models.study.scans)
+        prepared = prepare_scans(out, models.study.scans)
         for stage, state in closed.ends.items():
             fit = models.fit(state)
             maps[stage] |= {scan.id: fit.expected_um(scan) for scan in prepared}
             numbers[stage] = max(fit.numbers, numbers[stage])
     rows = []
-    for stage, known in maps.items():
-        own = [known[scan.id] for scan in scans]
-        rows += error_rows(scans, own, numbers[stage], seed, model=stage, held_out=held_out)
+    for stage, own in maps.items():
+        expected = [own[scan.id] for scan in scans]
+        rows += error_rows(scans, expected, numbers[stage], seed, model=stage, held_out=held_out)
     return rows
 
 
@@ -272,18 +272,15 @@ def nested_errors(
     print), and score its result on the scans that were left out. Return the errors on all scans.
     """
     scans = study.stored
-    parts = study.fold_of.tolist() if nested == "folds" else [scan.print_id for scan in scans]
+    folds = parted(study, nested).folds
 
     def anew() -> Iterator[tuple[HeldOut, Closed, list[PrintedScan]]]:
-        numbered = enumerate(progress(sorted(set(parts)), "repeating all choices"), 1)
-        for number, part in numbered:
-            used, out = (
-                [scan for scan, own in zip(scans, parts, strict=True) if (own == part) == left_out]
-                for left_out in (False, True)
-            )
+        for number in progress(range(len(folds)), "repeating all choices"):
+            rest, own = folds[number]
+            out = [scans[i] for i in own]
             names = ", ".join(scan.id for scan in out)
-            study.report(f"leaving out {names} and repeating all choices ({number} of {len(set(parts))})")
-            closed = close_again(used)
+            study.report(f"leaving out {names} and repeating all choices ({number + 1} of {len(folds)})")
+            closed = close_again([scans[i] for i in rest])
             yield HeldOut(closed.given), closed, out
 
     return errors_of_others(anew(), scans, f"nested {nested}", study.seed)

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.stats import rankdata
 
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
@@ -111,20 +112,20 @@ class PreparedScan:
         own = quadrants[part_to_fit(counts, self.number % 4)]
         sampled = np.zeros(shape, bool)
         sampled[own] = self._inner[own]
-        rows, columns = (
+        rows, columns = area = tuple(
             slice(max(part.start - _MARGIN_PX, 0), min(part.stop + _MARGIN_PX, size))
             for part, size in zip(own, shape, strict=True)
         )
         stored = replace(
             self.stored,
-            mask_level=self.stored.mask_level[rows, columns],
-            height_um=self.stored.height_um[rows, columns],
-            valid=sampled[rows, columns],
+            mask_level=self.stored.mask_level[area],
+            height_um=self.stored.height_um[area],
+            valid=sampled[area],
             height_sigma_um=None,
         )
         y_um, x_um = (
             old + (part.start + part.stop - size) / 2 * context.pitch_um
-            for old, part, size in zip(context.field_centre_um, (rows, columns), shape, strict=True)
+            for old, part, size in zip(context.field_centre_um, area, shape, strict=True)
         )
         context = replace(
             context,
@@ -134,15 +135,13 @@ class PreparedScan:
             scan_shape=shape,
             origin_px=(rows.start, columns.start),
         )
-        return PreparedScan(stored, context, self.line[rows, columns], self.number)
+        return PreparedScan(stored, context, self.line[area], self.number)
 
     @cached_property
     def _inner(self) -> np.ndarray:
         ny, nx = self.stored.shape
         border = sample_border_px(min(ny, nx))
-        inside = np.zeros((ny, nx), bool)
-        inside[border : ny - border, border : nx - border] = True
-        return inside & self.usable
+        return np.pad(self.usable[border : ny - border, border : nx - border], border)
 
     def at_sample(self, field_map: np.ndarray) -> np.ndarray:
         """Return the values of a map of shape (ny, nx) at the sampled pixels, as float64. The result has
@@ -160,8 +159,7 @@ class PreparedScan:
         """Return an orthonormal basis of the named scan terms at the sampled pixels. The terms are computed
         from a predicted height, µm, of shape (ny, nx). The result has shape (n, k).
         """
-        maps = self.terms_at_sample(prediction_um, terms)
-        return orthonormal(maps.T)
+        return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
     def freed(self, values: np.ndarray, prediction_um: np.ndarray) -> np.ndarray:
         """Project all free terms out of values at the n sampled pixels. The terms are computed from a
@@ -171,15 +169,26 @@ class PreparedScan:
         return values - basis @ (basis.T @ values)
 
 
-def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
-    """Prepare all scans of a store. Positions in the writing order are scaled so that they run from -0.5
-    (first of these scans) to 0.5 (last).
+def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = ()) -> list[PreparedScan]:
+    """Prepare scans of one printer.
+
+    Args:
+        scans: the scans. Their positions in the writing order are scaled so that they run from -0.5 (first of
+            these scans) to 0.5 (last).
+        known: scans that have already been prepared. If they are given, the position of each scan is instead
+            interpolated between their scaled positions, so that the positions of all scans have the same
+            scale.
     """
-    ranks = np.argsort(np.argsort([scan.order for scan in scans], kind="stable"), kind="stable")
-    scaled = ranks / max(len(scans) - 1, 1) - 0.5 if len({s.order for s in scans}) > 1 else 0.0 * ranks
+    orders = [scan.order for scan in scans]
+    if known:
+        stated = sorted((one.stored.order, one.context.order) for one in known)
+        places = np.interp(orders, *np.transpose(stated))
+    elif len(set(orders)) > 1:
+        places = (rankdata(orders, "ordinal") - 1) / (len(orders) - 1) - 0.5
+    else:
+        places = np.zeros(len(orders))
     prepared = []
-    for number, (scan, order) in enumerate(zip(scans, scaled.tolist(), strict=True)):
-        dose = 1.0 if scan.dose is None else float(scan.dose)
+    for number, (scan, order) in enumerate(zip(scans, places.tolist(), strict=True)):
         write = scan.write or {}
         context = FieldContext(
             layout_um=torch.from_numpy(exposed(scan).layout_um)[None, None],
@@ -193,24 +202,11 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
             quarter_turns=scan.quarter_turns,
             backward=scan.direction == -1,
             new_tip=scan.tip not in (None, 1),
-            pixel_size=1.0 if scan.pixel_size is None else float(scan.pixel_size),
-            dose=dose,
+            pixel_size=float(scan.pixel_size or 1),
+            dose=float(scan.dose or 1),
         )
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
         prepared.append(PreparedScan(scan, context, line, number))
-    return prepared
-
-
-def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans, in addition to the prepared scans ``known``. The position of each further scan
-    in the writing order is interpolated between the scaled positions of the known scans, so that the
-    positions of all scans have the same scale.
-    """
-    orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
-    prepared = []
-    for scan in prepare_scans(scans):
-        order = float(np.interp(scan.stored.order, orders, places))
-        prepared.append(replace(scan, context=replace(scan.context, order=order)))
     return prepared
 
 

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from litho_models.effects import get_effect
 from litho_models.loop.fits import TwinProblem, fit_state
 from litho_models.loop.model import Slot, Twin, Values
-from litho_models.loop.prepared import LARGE_PX, prepare_scans, prepared_among
+from litho_models.loop.prepared import LARGE_PX, prepare_scans
 from litho_models.loop.results import clustered_covariance
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import (
@@ -231,14 +231,14 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
 def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
     """Check that new scans get positions in the known printing order, so that a drift continues."""
     stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]
-    found = prepared_among(stored, study.scans)
+    found = prepare_scans(stored, study.scans)
     assert [one.context.order for one in found] == [
         study.scans[3].context.order,
         study.scans[7].context.order,
     ]
-    late = prepared_among([replace(stored[0], order=99)], study.scans)[0]
+    late = prepare_scans([replace(stored[0], order=99)], study.scans)[0]
     assert late.context.order == 0.5
-    between = prepared_among(stored[1:], study.scans[::2])[0]
+    between = prepare_scans(stored[1:], study.scans[::2])[0]
     assert between.context.order == pytest.approx(
         (study.scans[6].context.order + study.scans[8].context.order) / 2
     )

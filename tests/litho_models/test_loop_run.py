@@ -305,9 +305,7 @@ def test_a_strength_of_one_print_is_unknown_where_this_print_is_left_out() -> No
     expected = []
     for last_um in (0.16, 0.4):
         state = _losses(last_um)[1]
-        prints = [scan.print_id for scan in state.study.stored]
-        models = HeldOut(state.study)
-        maps, _ = models._without_parts(dict.fromkeys(sorted(set(prints)), state.twin), prints)
+        maps, _ = HeldOut(state.study)._predicted(state, by="prints")
         expected.append(maps[-1] - maps[-1].mean())
     # The fit starts from the fit to all scans. Each scan has its own datum and gain, so the gain of the model
     # stays near its start, and with it up to 2 nm of these maps. The loss changes the print by up to 0.1 µm.
