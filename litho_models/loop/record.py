@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from statistics import fmean
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -11,7 +12,6 @@ from pydantic import Field
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.effects import CATALOGUE
 from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.policies import Policy, usual_policy
@@ -71,7 +71,7 @@ class ErrorRow(Record):
     mae_ci95_nm: tuple[float, float] | None
     rmse_nm: float
     by_scan_nm: dict[str, float]
-    edge_by_scan_nm: dict[str, float] = Field(default_factory=dict)
+    edge_by_scan_nm: dict[str, float]
 
     @property
     def leading_by_scan_nm(self) -> dict[str, float]:
@@ -83,7 +83,7 @@ class ErrorRow(Record):
     @property
     def leading_nm(self) -> float:
         """Return the mean of the main error over scans."""
-        return sum(self.leading_by_scan_nm.values()) / len(self.leading_by_scan_nm)
+        return fmean(self.leading_by_scan_nm.values())
 
     @property
     def is_headline(self) -> bool:
@@ -150,8 +150,8 @@ class FoundEffect(Record):
     p_confirm: float
     family_p: float
     group_p: float | None
-    left_out_nm: float | None = None
-    survives_on: list[str] = Field(default_factory=list)
+    left_out_nm: float
+    survives_on: list[str]
 
 
 class Candidate(Record):
@@ -160,8 +160,8 @@ class Candidate(Record):
     name: str
     verdict: CandidateVerdict
     reason: str
-    p_screen: float | None = None
-    gain_nm2: float | None = None
+    p_screen: float | None
+    gain_nm2: float | None
 
 
 class ScanFinding(Record):
@@ -184,16 +184,6 @@ class ScanFinding(Record):
     p: float | None = None
     spread: dict[str, Strength] = Field(default_factory=dict)
     confusable_with: list[str] = Field(default_factory=list)
-
-    @classmethod
-    def of(cls, name: str, evidence: str, *, seen: object, **facts: Any) -> ScanFinding:
-        """Make a finding. Its title and role are taken from the catalogue of effects, unless ``facts``
-        contains them.
-        """
-        effect = CATALOGUE.get(name)
-        role = effect.role if effect else "measurement"
-        known = {"title": effect.title if effect else name, "role": role, **facts}
-        return cls(name=name, evidence=evidence, seen=bool(seen), **known)
 
 
 class Planted(Record):
@@ -289,11 +279,11 @@ class CloseLoop(Result):
     over_prints: OverUnits | None
     effects: list[FoundEffect]
     candidates: list[Candidate]
-    single_scans: list[ScanFinding] = Field(default_factory=list)
-    planted: list[Planted] = Field(default_factory=list)
+    single_scans: list[ScanFinding]
+    planted: list[Planted]
     measurement: MeasurementModel
     explained: list[Explained]
-    decisions: list[Decision] = Field(default_factory=list)
+    decisions: list[Decision]
     verdict: Verdict
     fewest_scans: int
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
@@ -23,13 +24,12 @@ from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Nested, errors_of_others, nested_errors
 from litho_models.loop.fits import Study
-from litho_models.loop.marks import rounding_um, with_marks
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
-from litho_models.loop.single_scans import SingleScans
+from litho_models.loop.single_scans import SingleScans, rounding_um
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split
 
@@ -91,17 +91,14 @@ def close_loop(
         report: function that receives the progress messages.
 
     Raises:
-        InputError: there is no store, the base is unknown, fewer than two scans are usable, or ``nested`` is
-            set although the loop does not refit the base.
+        InputError: there is no store, the base is unknown, the usable scans show fewer than two printed
+            fields, or ``nested`` is set although the loop does not refit the base.
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
     usable, dropped = measured_scans(opened)
     locked = [scan for scan in usable if scan.id in opened.locked_ids]
     development = [scan for scan in usable if scan.id not in opened.locked_ids]
-    if len(development) < 2:
-        got = f"{len(development)} that can be used and are not locked"
-        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
     settings = {
         "base": base, "base_settings": dict(base_settings), "folds": folds, "nested": nested,
         "inject": list(inject), "steps": steps,
@@ -125,23 +122,23 @@ def close_loop(
             raise InputError("--nested prints", got="scans of one print", wanted="scans of at least 2 prints")
         closed = close(study, bases)
 
-        def close_again(scans: Sequence[PrintedScan], named: Collection[str] = bases.keys()) -> Closed:
-            return close(Study.dealt(scans, folds, seed, places), {name: bases[name] for name in named})
+        def close_again(bases: Mapping[str, nn.Module], scans: Sequence[PrintedScan]) -> Closed:
+            return close(Study.dealt(scans, folds, seed, places), bases)
 
         models = HeldOut(study)
         alone: list[ScanFinding] = []
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
-            maps = models.maps_um(closed.final)
-            terms = SingleScans(study, maps).findings()
-            alone = with_marks(terms, study.scans, maps, rounding_um(opened, development))
+            maps, steps_um = models.maps_um(closed.final), rounding_um(opened, development)
+            alone = SingleScans(study, maps, steps_um).findings()
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
         errors, left_out_nm = models.errors(closed), models.left_out_nm(closed)
         if nested:
-            errors += nested_errors(study, nested, partial(close_again, named=[closed.base_name]))
+            chosen = {closed.base_name: bases[closed.base_name]}
+            errors += nested_errors(study, nested, partial(close_again, chosen))
         if open_lock_box and locked:
             errors += errors_of_others([(models, closed, locked)], locked, "locked", seed)
-        planted = [plant(*one, closed, close_again) for one in wanted]
+        planted = [plant(*one, closed, partial(close_again, bases)) for one in wanted]
         result = record(
             closed,
             errors,
@@ -195,15 +192,14 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
         process_effects=on("process"),
         measurement_effects=on("measurement"),
         undetermined_effects=on("nuisance", "undetermined"),
-        dataset=result.dataset.model_dump(mode="json"),
+        dataset=result.dataset,
         attributed={
             one.name: sides[one.role]
             for one in result.effects
             if one.role in sides and get_effect(one.name).role != one.role
         },
-        command=result.run.command,
         split={
-            **result.split.model_dump(mode="json"),
+            **dict(result.split),
             "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
         },
         training_level_share=level_share(closed.given.stored),

@@ -10,9 +10,9 @@ import pytest
 
 from litho_data.register.bend import Bend
 from litho_data.store import PrintedScan
-from litho_models.loop.marks import rounding_step_um, with_marks
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import ScanFinding
+from litho_models.loop.single_scans import rounding, rounding_step_um, scars, with_bends
 from tests.litho_models.loop_scans import blank_scans, with_heights
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
@@ -20,14 +20,11 @@ HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
 TURNED = np.array([[0.0, -1.0, 19.2], [1.0, 0.0, 0.0], [0, 0, 1]])
 
 
-REGISTRATION = ScanFinding.of("registration-residual", "too small to matter", seen=False)
-
-
-def found_in(scans: Sequence[PrintedScan], rounding_um: Sequence[float] = ()) -> dict[str, ScanFinding]:
-    """Return the findings about scans of flat layouts whose registration has left nothing."""
-    maps = [np.zeros(scan.shape) for scan in scans]
-    found = with_marks([REGISTRATION], prepare_scans(scans), maps, rounding_um)
-    return {one.name: one for one in found}
+def straightened(scans: Sequence[PrintedScan]) -> ScanFinding:
+    """Return the finding about the bends of scans whose registration has left nothing."""
+    facts = {"name": "registration-residual", "title": "", "role": "measurement"}
+    left = ScanFinding.model_validate({**facts, "seen": False, "evidence": "too small to matter"})
+    return with_bends(left, prepare_scans(scans))
 
 
 @pytest.mark.parametrize("step_um", [0.001, 0.0268])
@@ -43,19 +40,13 @@ def test_heights_that_were_not_rounded_have_no_step() -> None:
     assert rounding_step_um(np.zeros((4, 4))) == 0.0
 
 
-def test_rounding_counts_by_the_noise_it_adds_and_is_unknown_without_raw_files() -> None:
-    scans = blank_scans(2)
-
-    def rounding(step_um: float) -> ScanFinding:
-        return found_in(scans, [step_um] * len(scans))["quantisation"]
-
+def test_rounding_counts_by_the_noise_it_adds() -> None:
     # Rounding to steps of q adds a variance of q² / 12.
-    coarse = rounding(0.012 * np.sqrt(12))
+    coarse = rounding([0.012 * np.sqrt(12)] * 2)
     assert coarse.seen
     assert "12 nm rms" in coarse.evidence
-    assert not rounding(0.0001 * np.sqrt(12)).seen
-    assert not rounding(0.0).seen
-    assert set(found_in(scans)) == {"registration-residual", "scars-and-spikes"}
+    assert not rounding([0.0001 * np.sqrt(12)] * 2).seen
+    assert not rounding([0.0, 0.0]).seen
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -68,7 +59,7 @@ def test_scars_are_told_from_marks_across_the_lines(along: bool, turned: bool) -
     scans = blank_scans(10, 64)
     if turned:
         scans = [replace(scan, scan_to_layout=TURNED) for scan in scans]
-    one = found_in(with_heights(scans, [grain] * 10))["scars-and-spikes"]
+    one = scars(prepare_scans(with_heights(scans, [grain] * 10)), [np.zeros(grain.shape)] * 10)
     assert one.seen is along
     assert ("30 outliers are elongated along the scan lines and 0 " in one.evidence) is along
 
@@ -76,10 +67,10 @@ def test_scars_are_told_from_marks_across_the_lines(along: bool, turned: bool) -
 def test_what_registration_straightened_is_told() -> None:
     scans = blank_scans(3, 64)
     bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (64, 64), (0.1, 0.1))
-    straight = found_in(scans)["registration-residual"]
+    straight = straightened(scans)
     assert not straight.seen
     assert straight.evidence == "too small to matter; the registration straightened 0 of 3 scans"
-    one = found_in([replace(scans[0], bend_um=bend), *scans[1:]])["registration-residual"]
+    one = straightened([replace(scans[0], bend_um=bend), *scans[1:]])
     assert one.seen
     # Along x, 0.3 (u² - 1/3) is largest at u = 1, where it is two thirds of 0.3.
     assert "1 of 3 scans, which were bent by up to 0.20 µm" in one.evidence
