@@ -4,7 +4,7 @@ rejected effects. The strengths of the effects have confidence intervals, and ea
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import Any
 
@@ -54,22 +54,18 @@ def record(
         left_out_nm: values of ``FoundEffect.left_out_nm``, keyed by the name of the effect.
         given: the remaining fields of the record.
     """
-    study, final = closed.study, closed.final.twin
+    study = closed.study
     effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
-    before, after = (
-        next(row.leading_by_scan_nm for row in errors if row.is_headline and row.model == model)
-        for model in ("base", "all")
-    )
-    gains = [before[scan.id] - after[scan.id] for scan in study.scans]
-    prints = [scan.stored.print_id for scan in study.scans]
+    headline = {row.model: row.leading_by_scan_nm for row in errors if row.is_headline}
+    gains = [headline["base"][scan.id] - headline["all"][scan.id] for scan in study.scans]
     return CloseLoop(
         **given,
         base_model=closed.base_name,
         base_values=_values(closed.base.twin),
-        corrected_values=_values(final),
+        corrected_values=_values(closed.final.twin),
         errors=errors,
         effects=effects,
-        candidates=_candidates(closed, effects, {one.name for one in single_scans}),
+        candidates=_candidates(closed, effects, single_scans),
         single_scans=single_scans,
         explained=[
             Explained(
@@ -84,7 +80,7 @@ def record(
         fewest_scans=FEWEST_SCANS,
         gain_nm=float(np.mean(gains)),
         over_scans=over_units(gains, seed=study.seed),
-        over_prints=over_prints(gains, prints, study.seed),
+        over_prints=over_prints(gains, [scan.stored.print_id for scan in study.scans], study.seed),
     )
 
 
@@ -109,25 +105,28 @@ def _values(twin: Twin) -> dict[str, float]:
 
 
 def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
-    effect, judgement = get_effect(cause.name), cause.judgement
-    verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
-    roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
+    effect, judgement, names = get_effect(cause.name), cause.judgement, [cause.name, *cause.alike]
+    role, *others = {get_effect(name).role for name in names}
+    knowledge, on = effect.knowledge, survives_on(cause, closed.rivals)
     # If the search with another base does not find a cause, the cause may only correct an error of the chosen
     # base.
-    unsure = effect.knowledge == "cause" and cause.role is None
-    corrects, on = unsure and not closed.needed_by_all(cause), survives_on(cause, closed.rivals)
-    knowledge: Knowledge = "description" if corrects else effect.knowledge
-    unnamed: EffectVerdict = "confusable" if cause.alike else "explained"
+    if knowledge == "cause" and cause.role is None and not closed.needed_by_all(cause):
+        knowledge = "description"
+    verdicts: dict[Knowledge, EffectVerdict] = {
+        "cause": "confusable" if cause.alike else "explained",
+        "law": "lawful",
+        "description": "described",
+    }
     return FoundEffect(
         name=cause.name,
         title=effect.title,
         knowledge=knowledge,
-        role=cause.role or (effect.role if len(roles) == 1 else "undetermined"),
-        verdict="explained" if cause.role else verdicts.get(knowledge, unnamed),
+        role=cause.role or ("undetermined" if others else role),
+        verdict="explained" if cause.role else verdicts[knowledge],
         by=cause.by,
         strengths=_strengths(closed, cause.name),
         confusable_with=list(cause.alike),
-        separating_experiment=separating([cause.name, *cause.alike]),
+        separating_experiment=separating(names),
         gain_nm2=judgement.gain_nm2,
         before_nm2=judgement.before_nm2,
         scans_improved=judgement.improved,
@@ -146,27 +145,18 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     only one scan has no interval.
     """
     twin, scans = closed.final.twin, closed.study.scans
-    kinds = [independent(scans), [scan.id for scan in scans]]
-    # Half-widths of the confidence intervals of all fitted parameters, first from independent units and then
-    # from single scans.
-    reaches = []
-    for units in kinds:
-        sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
-        reaches.append(t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd)
+    kinds = independent(scans), [scan.id for scan in scans]
     found = dict[str, list[Strength]]()
     for at, slot in enumerate(twin.slots, twin.own):
         if slot.effect == name:
             own = [twin.is_of(slot, scan) for scan in scans]
             # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single
             # unit would be zero and would show no scatter.
-            known = (
-                float(reach[at])
-                for reach, units in zip(reaches, kinds, strict=True)
-                if len({*compress(units, own)}) > 1
-            )
-            value, reach = float(twin.vector[at]), next(known, 0.0)
-            ci95 = (value - reach, value + reach) if reach else None
-            strength = Strength(label=slot.label or "", value=value, unit=slot.facts.unit, ci95=ci95)
+            units = next((units for units in kinds if len({*compress(units, own)}) > 1), [])
+            variance = clustered_covariance(closed.final.linear, units)[at, at] if units else 0.0
+            value, unit = float(twin.vector[at]), slot.facts.unit
+            ci95 = t.interval(0.95, len({*units}) - 1, value, np.sqrt(variance)) if variance > 0 else None
+            strength = Strength(label=slot.label or "", value=value, unit=unit, ci95=ci95)
             found.setdefault(slot.parameter, []).append(strength)
     # Choices are not fitted.
     for key, value in twin.values()[name].items():
@@ -189,30 +179,30 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
         linear: the linearised least-squares problem of each scan at the optimum.
         units: the cluster (print or scan) to which each scan belongs.
     """
-    parts = [eliminated(part, RULES.term_weight) for part in linear]
-    normal = np.sum([part[0] for part in parts], axis=0)
-    inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-    names = sorted(set(units))
-    scores = np.stack(
-        [np.sum([p[1] for p, own in zip(parts, units, strict=True) if own == name], axis=0) for name in names]
-    )
+    normals, gradients, _ = zip(*(eliminated(part, RULES.term_weight) for part in linear), strict=True)
+    inverse = np.linalg.pinv(np.sum(normals, axis=0), rcond=1e-10, hermitian=True)
+    names, cluster = np.unique(units, return_inverse=True)
+    scores = np.zeros((len(names), len(inverse)))
+    np.add.at(scores, cluster, gradients)
     return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
 
 
-def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
+def _candidates(
+    closed: Closed, added: Sequence[FoundEffect], single_scans: Sequence[ScanFinding]
+) -> list[Candidate]:
     """List the effects that were not added to the model, each with the reason.
 
     Args:
         closed: the loop.
         added: the effects that were added.
-        seen: names of the per-scan terms and marks, which the record lists elsewhere.
+        single_scans: findings about per-scan terms and marks, which the record lists elsewhere.
     """
     named, films, count = closed.named, closed.study.of_films, len(closed.study.scans)
     sets = {other: one.name for one in added for other in one.confusable_with}
     excluded = {other: one.name for one in closed.traced for other in one.excluded}
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
     tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
-    told = {*seen, *(one.name for one in added)}
+    told = {*(one.name for one in added), *(one.name for one in single_scans)}
 
     def refused(name: str) -> tuple[CandidateVerdict, str]:
         last, reason = named.last.get(name), named.refused.get(name, "")
