@@ -32,7 +32,8 @@ from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
 Maps = list[np.ndarray]
-Nested = Literal["folds", "prints"]
+# The parts of a study that are left out one after the other.
+Parts = Literal["folds", "prints"]
 
 
 class Fit(NamedTuple):
@@ -51,7 +52,7 @@ class Fit(NamedTuple):
         return self.measurement.expected_um(scan.stored, self.twin.height(scan))
 
 
-def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
+def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int, refit: bool = True) -> Fit:
     """Fit a measurement model, then the model of the printer, and then the coefficients of the measurement
     model again, all to the same scans.
 
@@ -120,7 +121,7 @@ def error_rows(
     return rows
 
 
-def parted(study: Study, by: Nested) -> Study:
+def parted(study: Study, by: Parts) -> Study:
     """Return the study with its own folds (``folds``), or with one fold per print (``prints``)."""
     if by == "folds":
         return study
@@ -200,7 +201,7 @@ class HeldOut:
         return fit_with_measurement(state.twin, self.study.scans, self.study.seed)
 
     def _predicted(
-        self, state: State, refit: bool = True, by: Nested = "folds"
+        self, state: State, refit: bool = True, by: Parts = "folds"
     ) -> tuple[Maps, tuple[int, int]]:
         """Predict each scan by a fit to the scans outside its fold (or to the scans of all other prints).
         Return the predicted maps, and the numbers of parameters of the printer model and the measurement
@@ -266,7 +267,7 @@ def errors_of_others(
 
 
 def nested_errors(
-    study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
+    study: Study, nested: Parts, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
     """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
     print), and score its result on the scans that were left out. Return the errors on all scans.

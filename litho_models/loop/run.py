@@ -22,7 +22,7 @@ from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
-from litho_models.loop.errors import HeldOut, Nested, errors_of_others, nested_errors
+from litho_models.loop.errors import HeldOut, Parts, errors_of_others, nested_errors
 from litho_models.loop.fits import Study
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
@@ -46,7 +46,7 @@ def close_loop(
     base: str = AUTO,
     base_settings: Mapping[str, Any] = {},
     folds: int = GROUPED_FOLDS,
-    nested: Nested | None = None,
+    nested: Parts | None = None,
     inject: Sequence[str] = (),
     open_lock_box: bool = False,
     steps: int | None = None,
@@ -122,8 +122,8 @@ def close_loop(
             raise InputError("--nested prints", got="scans of one print", wanted="scans of at least 2 prints")
         closed = close(study, bases)
 
-        def close_again(bases: Mapping[str, nn.Module], scans: Sequence[PrintedScan]) -> Closed:
-            return close(Study.dealt(scans, folds, seed, places), bases)
+        def close_again(among: Mapping[str, nn.Module], scans: Sequence[PrintedScan]) -> Closed:
+            return close(Study.dealt(scans, folds, seed, places), among)
 
         models = HeldOut(study)
         alone: list[ScanFinding] = []
