@@ -184,7 +184,9 @@ def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = 
         stated = sorted((one.stored.order, one.context.order) for one in known)
         places = np.interp(orders, *np.transpose(stated))
     elif len(set(orders)) > 1:
-        places = (rankdata(orders, "ordinal") - 1) / (len(orders) - 1) - 0.5
+        # Scans with the same position, such as two scans of one print, stay together.
+        ranks = rankdata(orders, "dense")
+        places = (ranks - 1) / (ranks.max() - 1) - 0.5
     else:
         places = np.zeros(len(orders))
     prepared = []

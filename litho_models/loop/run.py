@@ -19,6 +19,7 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
 from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
+from litho_models.frozen.card import OUT_OF_FOLD
 from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
@@ -92,7 +93,8 @@ def close_loop(
 
     Raises:
         InputError: there is no store, the base is unknown, the usable scans show fewer than two printed
-            fields, or ``nested`` is set although the loop does not refit the base.
+            fields, or ``nested`` is set although the loop does not refit the base or although there is only
+            one print.
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
@@ -206,6 +208,13 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
         training_step_share=step_share(closed.given.stored),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
-            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy}
+            {
+                "name": "mae_datum_free",
+                "value": error.mae_nm,
+                "ci95": error.mae_ci95_nm,
+                "split": OUT_OF_FOLD,
+                "policy": error.policy,
+                "background": "shared",
+            }
         ],
     )

@@ -179,6 +179,14 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
         close_loop(store, tmp_path / "out", base="zoo:pbl", nested="prints")
 
 
+def test_prints_are_left_out_only_if_there_are_two(tmp_path: Path) -> None:
+    """Check that one print is refused at once, and not after the loop."""
+    scans = [replace(scan, print_id="1") for scan in make_scans(6, size_px=56)]
+    store = write_store(tmp_path / "s.zarr", scans)
+    with pytest.raises(InputError, match="--nested prints, got scans of one print"):
+        close_loop(store, tmp_path / "out", base="physics", nested="prints")
+
+
 @pytest.mark.slow
 def test_the_loop_starts_where_the_benchmark_ends(tmp_path: Path) -> None:
     """Check that the loop and the benchmark use the same fits of a network and state the same error."""

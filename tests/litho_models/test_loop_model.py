@@ -228,6 +228,14 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
     assert state.mse_nm2 > 16
 
 
+def test_scans_of_the_same_position_in_the_order_stay_together() -> None:
+    orders = (0, 4, 4, 9)
+    scans = [replace(s, order=order) for s, order in zip(blank_scans(4, 32), orders, strict=True)]
+    prepared = prepare_scans(scans)
+    assert [one.context.order for one in prepared] == [-0.5, 0.0, 0.0, 0.5]
+    assert [one.context.order for one in prepare_scans(scans, prepared)] == [-0.5, 0.0, 0.0, 0.5]
+
+
 def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
     """Check that new scans get positions in the known printing order, so that a drift continues."""
     stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]

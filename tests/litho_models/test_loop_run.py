@@ -221,6 +221,15 @@ def test_only_what_is_the_printers_is_exported(closed, store: Path, tmp_path: Pa
     assert [[*own] for own in exported] == [[name] for name in roles_of]
 
 
+def test_the_card_of_the_corrected_model_states_its_error_on_held_out_scans(closed) -> None:
+    result, out, _ = closed
+    row = result.error("all")
+    stated = ModelCard.read(out / "model").held_out
+    assert stated is not None
+    assert (stated.value, stated.ci95, stated.policy) == (row.mae_nm, row.mae_ci95_nm, row.policy)
+    assert f"Mean absolute error {stated.text}" in (out / "model" / "README.md").read_text("utf-8")
+
+
 def test_a_folder_of_the_loop_is_frozen_as_its_model(closed, tmp_path: Path) -> None:
     _, out, _ = closed
     card = freeze(out, tmp_path / "frozen")
