@@ -25,12 +25,13 @@ from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, errors_of_others, nested_errors
 from litho_models.loop.fits import Study
+from litho_models.loop.marks import rounding_um
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
-from litho_models.loop.single_scans import SingleScans, rounding_um
+from litho_models.loop.single_scans import SingleScans
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split
 

@@ -10,9 +10,9 @@ import pytest
 
 from litho_data.register.bend import Bend
 from litho_data.store import PrintedScan
+from litho_models.loop.marks import rounding, rounding_step_um, scars, with_bends
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import ScanFinding
-from litho_models.loop.single_scans import rounding, rounding_step_um, scars, with_bends
 from tests.litho_models.loop_scans import blank_scans, with_heights
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
