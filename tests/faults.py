@@ -120,7 +120,7 @@ FAULTS = [
           "for others, own in self.study.folds:", "for own, others in [(range(len(found)),) * 2]:",
           "tests/litho_models/test_single_scans.py -k other_folds"),
     Fault("a rival judged on scans that it was fitted on", "litho_models/loop/fits.py",
-          "maps = [per_fold[fold].height(one)", "maps = [common.height(one)",
+          "prediction = per_fold[fold].height(window)", "prediction = common.height(window)",
           "tests/litho_models/test_loop_model.py -k not_seen"),
     Fault("a measurement learned on held-out scans too", "litho_models/evaluation/fit_cache.py",
           "learn_background(fold.training, own)",

@@ -74,7 +74,7 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int, r
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
         measurement = learn_measurement(stored, [*map(twin.height, scans)], seed=seed, like=measurement)
     # Strengths of groups to which none of these scans belongs were not fitted here. Their values may be from
-    # the scans that are left out, so they are replaced.
+    # the scans that are left out, so they are removed.
     return Fit(twin.known_from(scans), measurement)
 
 

@@ -28,9 +28,10 @@ from litho_models.fitting.least_squares import (
     solve_damped,
     with_residuals,
 )
-from litho_models.loop.model import Twin
+from litho_models.loop.model import FoldedBase, Twin
 from litho_models.loop.prepared import FREE_TERMS, PreparedScan, prepare_scans
 from litho_models.scan_terms.grouped import Labels, groupings
+from litho_models.simulator import Simulator
 from litho_models.splits.folds import grouped_folds
 
 RULES = Rules("squares", steps=24, kept_above=0.8)
@@ -70,8 +71,8 @@ class Study:
         """Prepare scans and divide them into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]
         lists = grouped_folds(ids, [field_of(scan) for scan in scans], folds, seed)
-        fold = {one: number for number, members in enumerate(lists) for one in members}
-        return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
+        fold_of = np.argmax([[one in members for one in ids] for members in lists], axis=0)
+        return cls(prepare_scans(scans), fold_of, seed, workers, report)
 
     def __getstate__(self) -> dict[str, object]:
         """Leave out the workers and the function for progress messages, which cannot be sent to
@@ -82,7 +83,7 @@ class Study:
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
         """Return two lists of scan indices per fold: the scans outside the fold, and the scans inside it."""
-        own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
+        own = (self.fold_of == fold for fold in np.unique(self.fold_of))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
     @property
@@ -142,7 +143,7 @@ class State:
     freed_um: list[np.ndarray]
     # Cache of models without one of the effects, keyed by the name of this effect. Several steps of the loop
     # need the same model.
-    _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _without: dict[str, State] = field(default_factory=dict, init=False)
 
     @cached_property
     def freed_nm2(self) -> np.ndarray:
@@ -167,51 +168,53 @@ class State:
         """Predict the height of the print in each scan (or window), µm, of shape (ny, nx). Each prediction is
         made by the model that was fitted without the fold of this scan.
         """
-        folds = zip(self.study.fold_of, scans, strict=True)
-        return [self.per_fold[fold].height(scan) for fold, scan in folds]
+        return [
+            self.per_fold[fold].height(scan) for fold, scan in zip(self.study.fold_of, scans, strict=True)
+        ]
 
 
+@dataclass(frozen=True)
 class TwinProblem:
     """The least-squares problem of fitting a model to windows of scans. Derivatives are computed as
     difference quotients.
     """
 
-    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
-        self._twin = twin
-        self._windows = windows
+    twin: Twin
+    windows: Sequence[PreparedScan]
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         """Return the residuals, the derivatives and the free terms of all windows at the given parameters."""
-        here = self._twin.at(vector)
+        here = self.twin.at(vector)
         steps = here.steps()
         moved = [here.at(vector + one) for one in np.diag(steps)]
         linear = []
-        for window in self._windows:
+        for window in self.windows:
             fields: Fields = {}
             prediction = here.height(window, known=fields)
             value = window.at_sample(prediction)
             rows = np.zeros((len(steps), len(window.sample)))
-            for at, (other, slot) in enumerate(zip(moved, [None] * here.own + [*here.slots], strict=True)):
-                if slot is None or here.is_of(slot, window):
+            for at, other in enumerate(moved):
+                if at < here.own or here.slots[at - here.own].is_of(window):
                     # With cached fields, only the effect whose parameter changed and the effects after it are
                     # computed again.
                     there = other.height(window, known=ChainMap({}, fields))
                     rows[at] = (window.at_sample(there) - value) / steps[at]
-            basis = window.free_basis(prediction, FREE_TERMS).T
-            linear.append(Linearised(window.height - value, rows, basis))
+            linear.append(
+                Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
+            )
         return linear
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Return the measured minus the predicted heights of all windows at the given parameters, µm."""
-        twin = self._twin.at(vector)
-        return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
+        twin = self.twin.at(vector)
+        return [window.height - window.at_sample(twin.height(window)) for window in self.windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return two arrays: the lowest and the highest allowed step of each parameter. Steps within these
         limits keep all parameters within their ranges and change the parameters of the base only by small
         amounts.
         """
-        return self._twin.at(vector).room()
+        return self.twin.at(vector).room()
 
 
 def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
@@ -229,15 +232,17 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     start = twin.vector if from_here else _best_start(twin, windows)
     fitted = fit_least_squares(TwinProblem(twin, windows), start, RULES)
     common = twin.at(fitted.vector)
-    free = common.free()
-    linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
+    free = common.free()[:, None]
+    linear = [replace(part, jacobian=part.jacobian * free) for part in fitted.linear]
     per_fold = [
-        _without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own])
+        _of_fold(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own])
         for fold, (own, _) in enumerate(study.folds)
     ]
-    maps = [per_fold[fold].height(one) for fold, one in zip(study.fold_of, windows, strict=True)]
-    held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
-    freed = [one.freed(left, own) for one, left, own in zip(windows, held_out, maps, strict=True)]
+    held_out, freed = [], []
+    for fold, window in zip(study.fold_of, windows, strict=True):
+        prediction = per_fold[fold].height(window)
+        held_out.append(window.height - window.at_sample(prediction))
+        freed.append(window.freed(held_out[-1], prediction))
     return State(study, common, per_fold, linear, held_out, freed)
 
 
@@ -251,22 +256,24 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     effect. A fit that starts from these parameters may get stuck in a local optimum. For this reason, the
     second start is also tried.
     """
-    unfitted = twin.with_base_unfitted().vector
-    if not twin.slots or np.array_equal(unfitted, twin.vector):
+    base = twin.base
+    if not (twin.own and twin.slots and isinstance(base, Simulator)):
         return twin.vector
+    unfitted = replace(twin, numbers=Twin.bare(type(base)(base.config)).numbers)
     # Every third scan is enough to come close to the optimum.
     some = TwinProblem(twin, windows[::3] if len(windows) > 6 else windows)
-    fits = [fit_least_squares(some, start, RULES) for start in (twin.vector, unfitted)]
+    fits = [fit_least_squares(some, start.vector, RULES) for start in (twin, unfitted)]
     return min(fits, key=lambda fit: eliminated_sum(fit.linear, RULES.term_weight)[2]).vector
 
 
-def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
+def _of_fold(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
     """Fit the model to the windows outside a fold, using the derivatives of the common fit.
 
     The fit starts from the parameters of the common fit, which used all windows. It must therefore be
     iterated to convergence, so that no information about the fold remains.
     """
-    twin = common.of_fold(fold)
+    base = common.base
+    twin = replace(common, base=base.models[fold]) if isinstance(base, FoldedBase) else common
     problem, vector = TwinProblem(twin, windows), twin.vector
     if not len(vector):
         return twin
@@ -276,7 +283,7 @@ def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Seq
         linear = with_residuals(linear, problem.residuals(vector))
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(6):
-        step = solve_damped(normal, right, 1e-6, twin.at(vector).room())
+        step = solve_damped(normal, right, 1e-6, problem.room(vector))
         trial = vector + step
         # If the predicted gain of a step is this small, the linear model is exact enough.
         if promised_gain(normal, right, step) <= 1e-4 * total:

@@ -149,14 +149,14 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     found = dict[str, list[Strength]]()
     for at, slot in enumerate(twin.slots, twin.own):
         if slot.effect == name:
-            own = [twin.is_of(slot, scan) for scan in scans]
+            own = [*map(slot.is_of, scans)]
             # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single
             # unit would be zero and would show no scatter.
             units = next((units for units in kinds if len({*compress(units, own)}) > 1), [])
             variance = clustered_covariance(closed.final.linear, units)[at, at] if units else 0.0
             value, unit = float(twin.vector[at]), slot.facts.unit
             ci95 = t.interval(0.95, len({*units}) - 1, value, np.sqrt(variance)) if variance > 0 else None
-            strength = Strength(label=slot.label or "", value=value, unit=unit, ci95=ci95)
+            strength = Strength(label=slot.label, value=value, unit=unit, ci95=ci95)
             found.setdefault(slot.parameter, []).append(strength)
     # Choices are not fitted.
     for key, value in twin.values()[name].items():

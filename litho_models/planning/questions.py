@@ -28,11 +28,10 @@ from litho_data.store.schema import DatasetId, Instrument, Surround
 from litho_models.effects.chain import Frame
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
 from litho_models.loop.fits import RULES, TwinProblem
-from litho_models.loop.model import Added, Twin
+from litho_models.loop.model import Twin
 from litho_models.loop.prepared import ALL_FREE, PreparedScan, sample_border_px
 from litho_models.loop.run import QUESTIONS_FILE
 from litho_models.scan_terms import freed_um
-from litho_models.scan_terms.grouped import ALL
 
 _TILE_PX = 64
 
@@ -134,10 +133,9 @@ class Rival(Record):
         If this answer assumes that the printer causes the effect, the effect rotates with the print. If it
         assumes the microscope, the effect rotates with the scan.
         """
-        effects = {name: Added(ALL, {"": values}) for name, values in self.effects.items()}
         frames: dict[str, Frame] = {"microscope": "scan", "printer": "print"}
         own = {self.effect: frames[self.owner]} if self.owner else {}
-        return replace(base, effects=effects, frames=own).at(np.array(self.vector))
+        return replace(base.with_effects(self.effects), frames=own).at(np.array(self.vector))
 
 
 class Question(Record):

@@ -163,7 +163,7 @@ def test_the_search_adds_a_law_that_a_trained_model_lacks_and_none_that_it_has()
         # The residual is the white noise of 4 nm.
         assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.05)
         if names:
-            assert found.state.twin.values({})[LAW] == pytest.approx(STRENGTH, rel=0.03)
+            assert found.state.twin.values()[LAW] == pytest.approx(STRENGTH, rel=0.03)
 
 
 def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -> None:

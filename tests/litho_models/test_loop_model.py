@@ -53,23 +53,23 @@ def test_the_bare_twin_is_the_base(study) -> None:
     np.testing.assert_allclose(bare.height(scan), 0.9 * blurred + 0.03, atol=1e-5)
 
 
-def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin) -> None:
+def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin, study) -> None:
     assert twin.slots == [
-        Slot(THINNING, "along_x_um", "1"),
-        Slot(THINNING, "along_x_um", "2"),
-        Slot(THINNING, "along_y_um", "1"),
-        Slot(THINNING, "along_y_um", "2"),
-        Slot(THINNING, "exponent", None),
-        Slot(THINNING, "turn_deg", None),
+        Slot(THINNING, "along_x_um", "field", "1"),
+        Slot(THINNING, "along_x_um", "field", "2"),
+        Slot(THINNING, "along_y_um", "field", "1"),
+        Slot(THINNING, "along_y_um", "field", "2"),
+        Slot(THINNING, "exponent"),
+        Slot(THINNING, "turn_deg"),
     ]
     assert twin.own == 2
-    assert twin.values({"field": "2"}) == {THINNING: thinning(0.2)}
+    assert twin.values(study.scans[1]) == {THINNING: thinning(0.2)}
 
 
 def test_a_group_that_was_never_fitted_has_the_mean_of_the_others(twin: Twin, study) -> None:
-    assert twin.values({"field": "9"})[THINNING]["along_x_um"] == pytest.approx(0.15)
     stored = replace(study.scans[0].stored, groups={"field": "9"})
     elsewhere = replace(study.scans[0], stored=stored)
+    assert twin.values(elsewhere)[THINNING]["along_x_um"] == pytest.approx(0.15)
     one = Twin.bare(base_model()).with_effect(THINNING, ALL, {"": thinning(0.15)})
     np.testing.assert_allclose(twin.height(elsewhere), one.height(elsewhere), atol=1e-6)
 
@@ -77,23 +77,27 @@ def test_a_group_that_was_never_fitted_has_the_mean_of_the_others(twin: Twin, st
 def test_a_group_without_scans_has_the_mean_of_the_others(twin: Twin, study) -> None:
     first = [scan for scan in study.scans if scan.stored.groups["field"] == "1"]
     known = twin.known_from(first)
-    assert known.values({"field": "2"}) == known.values({"field": "1"}) == {THINNING: thinning(0.1)}
+    assert known.values(study.scans[1]) == known.values(study.scans[0]) == {THINNING: thinning(0.1)}
+    assert len(known.vector) == len(twin.vector) - 2
     assert np.array_equal(twin.known_from(study.scans).vector, twin.vector)
-    assert twin.known_from([]).values({"field": "1"})[THINNING]["along_x_um"] == 0.0
+    stored = replace(study.scans[0].stored, groups={"field": "9"})
+    elsewhere = replace(study.scans[0], stored=stored)
+    # Without a strength, the effect does nothing.
+    assert twin.known_from([elsewhere]).chain(elsewhere).values[THINNING]["along_x_um"] == 0.0
 
 
 def test_without_groups_every_scan_has_the_mean_strength(twin: Twin, study) -> None:
     plain = twin.ungrouped()
-    assert plain.values({"field": "1"}) == plain.values({}) == twin.values({})
-    assert plain.values({})[THINNING]["along_x_um"] == pytest.approx(0.15)
+    assert plain.values(study.scans[0]) == plain.values() == twin.values()
+    assert plain.values()[THINNING]["along_x_um"] == pytest.approx(0.15)
     assert plain.vector == pytest.approx(np.r_[twin.vector[: twin.own], 0.15, 0.0, 1.0, 0.0])
 
 
 def test_directions_are_chosen_and_never_fitted(study) -> None:
     lag = {"length_um": 0.2, "direction": -1.0}
     twin = Twin.bare(base_model()).with_effect("galvo-lag", ALL, {"": lag})
-    assert twin.slots == [Slot("galvo-lag", "length_um", None)]
-    assert twin.values({}) == {"galvo-lag": lag}
+    assert twin.slots == [Slot("galvo-lag", "length_um")]
+    assert twin.values() == {"galvo-lag": lag}
 
 
 def test_effects_act_in_their_order_however_they_came_and_leave_no_trace(twin: Twin) -> None:

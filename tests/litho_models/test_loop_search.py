@@ -65,9 +65,9 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
     assert cause.group_p is not None
     assert cause.group_p < 0.05
     assert cause.judgement.improved[0] >= 5
-    values = found.state.twin.values({"field": "2"})[THINNING]
-    assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
-    assert found.state.twin.values({"field": "1"})[THINNING]["along_x_um"] < 0.02
+    first, second = (found.state.twin.values(scan)[THINNING] for scan in found.state.study.scans[:2])
+    assert second["along_x_um"] == pytest.approx(0.2, rel=0.1)
+    assert first["along_x_um"] < 0.02
     assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
 
 
@@ -95,7 +95,7 @@ def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end(
     found = Found(state, [Cause(name, ALL, (), judged, 0.01, None) for name in (THINNING, MEMORY)])
     _defend(found)
     assert added(found) == {THINNING: "field", MEMORY: ALL}
-    assert found.state.twin.values({"field": "2"})[THINNING]["along_x_um"] == pytest.approx(0.2, rel=0.1)
+    assert found.state.twin.values(study.scans[1])[THINNING]["along_x_um"] == pytest.approx(0.2, rel=0.1)
 
 
 def test_a_cause_in_all_scans_is_found_with_one_strength(in_all_scans: Found) -> None:
@@ -109,7 +109,7 @@ def test_a_cause_in_all_scans_is_found_with_one_strength(in_all_scans: Found) ->
 def test_a_loss_along_a_diagonal_is_the_cause_with_its_direction() -> None:
     found = found_in((THINNING, ALL, {"": {**thinning(0.2), "turn_deg": 35.0}}))
     assert added(found) == {THINNING: ALL}
-    values = found.state.twin.values({})[THINNING]
+    values = found.state.twin.values()[THINNING]
     # A frame rotated by 35° equals one rotated by -55° with its axes swapped.
     assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
     assert values["turn_deg"] == pytest.approx(35, abs=3)

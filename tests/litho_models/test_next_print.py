@@ -121,7 +121,7 @@ def rival(effect: str, effects: dict[str, dict[str, float]], owner: Owner | None
     return Rival(
         effect=effect,
         owner=owner,
-        effects=twin.values({}),
+        effects=twin.values(),
         vector=twin.vector.tolist(),
         information=nothing,
         covariance=nothing,
