@@ -51,33 +51,26 @@ class Rest:
     def mean_nm2(self) -> float:
         return float(self.gains_nm2.mean())
 
-    @property
-    def share(self) -> float:
-        """Return the share of the squared error that the ridge regression explains."""
-        return self.mean_nm2 / max(float(self.squares_nm2.mean()), np.finfo(float).tiny)
-
     @cached_property
-    def ci95_nm2(self) -> tuple[float, float] | None:
-        """Return the 95 % confidence interval of the mean of ``gains_nm2``, or None if there are fewer than
-        six scans.
+    def ci95_nm2(self) -> tuple[float, float]:
+        """Return the 95 % confidence interval of the mean of ``gains_nm2``. Fewer than six scans are too few
+        for a confidence interval. In this case, return 0 and the mean.
         """
-        return interval(self.gains_nm2.tolist())
+        return interval(self.gains_nm2.tolist()) or (0.0, self.mean_nm2)
 
     @property
     def most_nm(self) -> float:
         """Return an upper bound on the rms error that inexact formulas of the model cause, nm. The bound is
         the square root of the upper end of ``ci95_nm2``.
         """
-        _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
-        return float(np.sqrt(max(most_nm2, 0.0)))
+        return float(np.sqrt(max(self.ci95_nm2[1], 0.0)))
 
     @property
     def matters(self) -> bool:
         """Return whether a relevant part of the residual can be learned. This is the case if the ridge
         regression explains more than 1 % of the squared error and the interval ``ci95_nm2`` lies above zero.
         """
-        low, _ = self.ci95_nm2 or (0.0, None)
-        return self.share > SMALLEST_SHARE and low > 0
+        return self.mean_nm2 > SMALLEST_SHARE * float(self.squares_nm2.mean()) and self.ci95_nm2[0] > 0
 
 
 class Learner:
@@ -99,17 +92,19 @@ class Learner:
         # The facts about each scan are its position in the writing order and the deviation of its dose from
         # nominal. A dependence on one of these facts can be learned only if the scans have at least three
         # different values of it.
-        facts = np.array([(s.context.order, s.context.dose - 1.0) for s in study.scans])
-        varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
-        rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
-        scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]
-        self._rows_of = [one / np.where(scale > 0, scale, np.float32(1)) for one in rows]
+        facts = np.array([(scan.context.order, scan.context.dose - 1.0) for scan in study.scans])
+        varied = facts[:, [len(np.unique(own)) >= 3 for own in facts.T]]
+        self._rows_of = [self._rows(model, *one) for one in zip(study.scans, varied, strict=True)]
         self._bases = [
             orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
             for scan, own in zip(study.scans, predictions, strict=True)
         ]
-        pairs = zip(self._rows_of, self._bases, strict=True)
-        self._grams = np.stack([gram(own.T.astype(np.float64), basis) / len(basis) for own, basis in pairs])
+        self._grams = np.stack(
+            [
+                gram(own.T.astype(np.float64), basis) / len(basis)
+                for own, basis in zip(self._rows_of, self._bases, strict=True)
+            ]
+        )
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
@@ -119,10 +114,8 @@ class Learner:
             predictions: predicted height of each scan, µm, of shape (ny, nx), by a model that was fitted
                 without the fold of this scan.
         """
-        scans, count = self._study.scans, self._grams.shape[1]
-        grams = np.zeros((len(scans), 1 + count, 1 + count))
-        grams[:, 1:, 1:] = self._grams
-        parts = zip(scans, predictions, self._rows_of, self._bases, grams, strict=True)
+        grams = np.pad(self._grams, [(0, 0), (1, 0), (1, 0)])
+        parts = zip(self._study.scans, predictions, self._rows_of, self._bases, grams, strict=True)
         for scan, own, rows, basis, products in parts:
             residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
@@ -132,7 +125,7 @@ class Learner:
         squares = grams[:, 0, 0] * NM_PER_UM**2
         return Rest(squares - left, squares)
 
-    def _rows(self, model: Features, scan: PreparedScan, varied: Sequence[float]) -> NDArray[np.float32]:
+    def _rows(self, model: Features, scan: PreparedScan, varied: np.ndarray) -> NDArray[np.float32]:
         """Return the m features at n pixels of a scan: the features of layout and position, some of their
         products, and products of some features with the writing order and the dose. The result has shape (m,
         n).
@@ -146,8 +139,7 @@ class Learner:
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
         # Products of the height, ∂y and ∂x with the position represent a gain and a displacement that depend
         # on the position.
-        placed = (18, 19, 20)
-        columns = [of_layout, of_place, *(of_place * of_layout[one] for one in placed)]
+        columns = [of_layout, of_place, *(of_place * of_layout[one] for one in (18, 19, 20))]
         for value in varied:
             columns += [value * varying, *((value > step) * varying for step in (-0.25, 0.0, 0.25))]
         return np.concatenate(columns).astype(np.float32)
@@ -159,19 +151,18 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     shape (scans,).
     """
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
-    columns = tuple(range(1, grams.shape[1]))
-    # The last argument of ``Block`` is the strength of the regularisation, stated as a number of scans.
-    blocks = [Block(columns, ALL, shrinking) for shrinking in (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)]
+    # The last argument of ``Block`` is the strength of the regularisation, stated as a number of scans. If
+    # only one scan is left for the fit, the strengths cannot be compared, and the first of them is used.
+    blocks = [
+        Block(tuple(range(1, grams.shape[1])), ALL, shrinking)
+        for shrinking in (100.0, 10.0, 1.0, 1e-1, 1e-2, 1e-3)
+    ]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # If only one scan is left for the fit, the regularisation cannot be chosen by cross-validation, so
-        # the strongest regularisation is used.
-        block = blocks[-1]
-        if len(rest) > 1:
-            block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
+        block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
         left[own] = products.squares([block], products.strengths([block], rest), own)
     return left
 
@@ -185,5 +176,5 @@ def _splines(size: int) -> np.ndarray:
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
-    knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, 3), [1.0] * 3])
+    knots = [-1.0] * 4 + [0.0] + [1.0] * 4
     return BSpline.design_matrix(position, knots, 3).toarray().T
