@@ -20,7 +20,7 @@ from litho_models.effects import Effect, get_effect
 from litho_models.loop.fits import State, fit_state
 from litho_models.loop.judging import judge_states
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.screening import WORTH_FITTING, Screened, Screening, Secants
+from litho_models.loop.screening import WORTH_FITTING, Screening, Secants
 from litho_models.loop.search import Cause, describe, with_table
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -41,7 +41,7 @@ class Check:
         laws, tables: all laws and tables that could replace a cause.
         left_nm2: the part of the model's mean squared residual that features of layout and position can
             still explain, nm².
-        secants: the changes that the laws and tables would make to the predictions.
+        secants: for each window, the changes that the laws and tables would make to the prediction.
     """
 
     state: State
@@ -49,7 +49,7 @@ class Check:
     laws: Sequence[Effect]
     tables: Sequence[Effect]
     left_nm2: float
-    secants: Secants
+    secants: Sequence[Secants]
 
     def of(self, cause: Cause) -> Cause:
         """Check one cause in the model that contains all other effects. Return the cause with its new
@@ -76,11 +76,10 @@ class Check:
         # the missing cause. A gain of the variants that is small relative to the unexplained error is
         # therefore no evidence against the effect.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
-            added = (
-                "variants of its change (scaled, blurred or displaced) would add "
-                f"{100 * share:.0f} % to its gain"
+            reason = (
+                "it only resembles the true cause: variants of its change (scaled, blurred or displaced) "
+                f"would add {100 * share:.0f} % to its gain"
             )
-            reason = f"it only resembles the true cause: {added}"
         return replace(cause, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
@@ -106,17 +105,29 @@ class Check:
         """Test whether short laws could replace a cause that has passed the checks of ``of``. Reject the
         cause if the model with the laws instead of the cause fits better.
 
-        At most two laws are used. Together, they have no more parameters than the cause.
+        At most two laws are used. Together, they have no more parameters than the cause. The law with the
+        largest predicted gain is added first.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
-        laws: list[str] = []
-        while len(laws) < 2 and (law := self._best_law(state, numbers)):
+        names: list[str] = []
+        for _ in range(2):
+            laws = [law for law in self.laws if law.name not in state.twin.names]
+            # The gain that the model with the cause still has over the model without it.
+            lost_nm2 = state.mse_nm2 - self.state.mse_nm2
+            promising = [
+                one
+                for one in Screening(state, laws, self.secants).candidates
+                if one.allowed and one.numbers <= numbers and one.gain_nm2 > WORTH_FITTING * lost_nm2
+            ]
+            if not promising:
+                break
+            law = max(promising, key=lambda one: one.gain_nm2)
             state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), state.study)
             numbers -= law.numbers
-            laws.append(law.name)
+            names.append(law.name)
             if not judge_states(self.state, state).reason():
-                return replace(cause, reason=f"short laws fit better than this cause: {', '.join(laws)}")
+                return replace(cause, reason=f"short laws fit better than this cause: {', '.join(names)}")
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
@@ -127,31 +138,13 @@ class Check:
         more than twice the gain of the cause, and held-out scans do not confirm the cause when it is added to
         the model with this table.
         """
-        least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
-            if table.judgement.gain_nm2 > least_nm2:
+            if table.judgement.gain_nm2 > 2 * cause.judgement.gain_nm2:
                 both = with_table(self.state, table)
-                judged = judge_states(both.without(cause.name), both)
-                if reason := judged.reason(cause.by):
-                    return replace(
-                        cause, reason=f"it is not needed when {table.name} is in the model: {reason}"
-                    )
+                if unneeded := judge_states(both.without(cause.name), both).reason(cause.by):
+                    reason = f"it is not needed when {table.name} is in the model: {unneeded}"
+                    return replace(cause, reason=reason)
         return cause
-
-    def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """Return the law with the largest predicted gain among the laws with at most ``numbers`` parameters.
-        Return None if no predicted gain exceeds ``WORTH_FITTING`` times the gain that the model with the
-        cause still has over ``state``.
-        """
-        laws = [law for law in self.laws if law.name not in state.twin.names]
-        least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
-        promising = (
-            one
-            for own in Screening(state, laws, self.secants).candidates.values()
-            for one in own.values()
-            if one.allowed and one.numbers <= numbers and one.gain_nm2 > least
-        )
-        return max(promising, key=lambda one: one.gain_nm2, default=None)
 
 
 def reshaped_gain(without: State, state: State) -> float:
@@ -163,17 +156,16 @@ def reshaped_gain(without: State, state: State) -> float:
         state: model with the cause.
     """
     grams, study = [], state.study
-    before, after = (one.maps_um(study.windows) for one in (without, state))
-    for window, left, own, other in zip(study.windows, state.held_out_um, after, before, strict=True):
+    maps_um = (one.maps_um(study.windows) for one in (state, without))
+    for window, left, own, other in zip(study.windows, state.held_out_um, *maps_um, strict=True):
         maps = _shapes(own - other, own, window)
         freed = window.freed(np.column_stack([left, *map(window.at_sample, maps)]), own)
         grams.append(freed.T @ freed / len(freed))
     # The last argument of ``Block`` is the weight of the prior that no variant is present, stated as a number
     # of scans. Without this prior, the many parameters would fit the noise of the few scans.
     products = Products.ungrouped(np.stack(grams))
-    count = products.grams.shape[1]
-    left = products.held_out([], study.fold_of)
-    taken = left - products.held_out([Block(tuple(range(1, count)), ALL, 0.02)], study.fold_of)
+    block = Block(tuple(range(1, products.grams.shape[1])), ALL, 0.02)
+    taken = products.grams[:, 0, 0] - products.held_out([block], study.fold_of)
     return float(taken.mean()) * NM_PER_UM**2
 
 
@@ -185,16 +177,15 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
         prediction: the prediction of the model with this cause, µm, of shape (ny, nx).
         window: the scan.
     """
-    pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
     # The widths of these blurs are in pixels, so that they suit the resolution of any process, including
     # films.
     near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
-    relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
+    relative, slopes = prediction - prediction.mean(), np.gradient(change, window.context.pitch_um)
     soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]
     y, x = (np.linspace(-1, 1, size) for size in change.shape)
-    place = y[:, None], x, y[:, None] ** 2 + x**2
-    factors = (1.0, relative, relative**2, np.abs(change), near, far, near - layout, *place)
+    y = y[:, None]
+    factors = (1.0, relative, relative**2, np.abs(change), near, far, near - layout, y, x, y**2 + x**2)
     return [
         *(change * one for one in factors),
         *soft,

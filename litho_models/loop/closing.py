@@ -95,24 +95,19 @@ class Closed:
         result is keyed by the stage of the loop: ``base``, ``causes``, ``laws`` or ``tables``. A stage that
         did not change the model is left out.
         """
-        added = {"causes": self.named, "laws": self.lawful, "tables": self.described}
-        stages = {"base": self.base} | {stage: found.state for stage, found in added.items()}
-        # A stage that changes nothing has the same model as the stage before it and is not listed.
-        return {
-            name: self.rest(state)
-            for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
-            if state is not before
+        # If a stage has the same model as the stage before it, it is replaced by the stage before it.
+        stages = {
+            self.final: "tables",
+            self.lawful.state: "laws",
+            self.named.state: "causes",
+            self.base: "base",
         }
+        return {stage: self.rest(state) for state, stage in reversed(stages.items())}
 
     @property
     def traced(self) -> list[Cause]:
         """Return the causes and the laws that were found."""
         return [*self.named.causes, *self.lawful.causes]
-
-    @property
-    def found(self) -> list[Cause]:
-        """Return all effects that were added to the model: causes, laws and tables."""
-        return [*self.traced, *self.described.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
         """Return whether the search with every other base model has also found the cause.
@@ -120,9 +115,8 @@ class Closed:
         Base models with more parameters than the chosen base model are ignored, because their parameters may
         have absorbed the cause.
         """
-        base = self.plain.twin.own
-        small = {name: rival for name, rival in self.rivals.items() if rival.state.twin.own <= base}
-        return len(survives_on(cause, small)) == len(small)
+        most = self.plain.twin.own
+        return all(rival.has(cause) for rival in self.rivals.values() if rival.state.twin.own <= most)
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
@@ -139,8 +133,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         study.report(f"fitting {name} to {len(study.scans)} scans")
         plain[name] = fit_state(Twin.bare(base), study)
     study.report("fitting the measurement errors that groups of scans share")
-    nearest = min(plain.values(), key=lambda state: state.mse_nm2)
-    freed = replace(study, scans=freed_scans(nearest))
+    freed = replace(study, scans=freed_scans(min(plain.values(), key=lambda state: state.mse_nm2)))
     excluded = untestable(freed)
     candidates = [
         one
@@ -187,21 +180,21 @@ def with_answer(
         values: starting values of the parameters of the effect.
         known: the fields ``alike``, ``excluded`` and ``role`` of the new `Cause`.
     """
+
+    @cache
+    def fitted(state: State) -> State:
+        if cause and (cause.name == name or cause.name not in state.twin.names):
+            return state
+        twin = state.twin.without(cause.name if cause else "")
+        return fit_state(twin.with_effect(name, ALL, {"": values}), state.study)
+
     if cause and cause.name == name:
-        fitted, answer = (lambda state: state), replace(cause, **known)
+        answer = replace(cause, **known)
     else:
-
-        @cache
-        def fitted(state: State) -> State:
-            if cause and cause.name not in state.twin.names:
-                return state
-            twin = state.twin.without(cause.name) if cause else state.twin
-            return fit_state(twin.with_effect(name, ALL, {"": values}), state.study)
-
         final = fitted(closed.final)
         judgement = judge_states(final.without(name), final)
-        first = {**closed.lawful.first, **closed.named.first}[name]
-        answer = Cause(name, ALL, judgement=judgement, family_p=first.family_p, group_p=None, **known)
+        family_p = {**closed.lawful.first, **closed.named.first}[name].family_p
+        answer = Cause(name, ALL, judgement=judgement, family_p=family_p, group_p=None, **known)
 
     def replaced(found: Found) -> Found:
         causes = [answer if one is cause else one for one in found.causes]
@@ -243,18 +236,6 @@ def freed_scans(state: State) -> list[PreparedScan]:
     return freed
 
 
-def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
-    """Return the names of the base models with which the search has found the cause, or an effect that looks
-    the same. ``searches`` contains the results of the searches, keyed by model name.
-    """
-    alike = {cause.name, *cause.alike, *cause.excluded}
-    return [
-        name
-        for name, found in searches.items()
-        if any(alike & {one.name, *one.alike} for one in found.causes)
-    ]
-
-
 def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
     them is chosen.
@@ -266,7 +247,7 @@ def _simplest(searches: Mapping[str, Found]) -> str:
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
         name: (
-            sum(len(survives_on(cause, searches)) < len(searches) for cause in found.causes),
+            sum(not all(other.has(cause) for other in searches.values()) for cause in found.causes),
             len(found.state.twin.vector),
         )
         for name, found in searches.items()
@@ -291,14 +272,14 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     """
     study = start.study
     # Tables describe heights, not films.
-    all_laws = [*(FILM_LAWS if study.of_films else LAWS).values()]
+    all_laws = (FILM_LAWS if study.of_films else LAWS).values()
     tables = [] if study.of_films else [*TABLES.values()]
-    secants = Secants(start.twin, study.windows)
+    secants = [Secants(start.twin, window) for window in study.windows]
     while True:
         study.report("searching the residual for laws")
         # A law with the same formula as a cause in the model is not tried, because it would only rename this
         # cause.
-        formulas = {get_effect(name).apply for name in named.names}
+        formulas = {get_effect(name).apply for name in named.state.twin.names}
         laws = [law for law in all_laws if law.apply not in formulas]
         lawful = search(named.state, laws, 4, secants)
         study.report("searching for tables that describe the residual")
@@ -308,8 +289,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
             # A table can fit almost anything, so it must gain more than all causes together.
             if described and described[0].judgement.gain_nm2 > start.mse_nm2 - named.state.mse_nm2:
                 in_place = with_table(in_place, described[0])
-            others = [*named.causes, *lawful.causes]
-            check = Check(in_place, others, laws, tables, rest(in_place).mean_nm2, secants)
+            left_nm2 = rest(in_place).mean_nm2
+            check = Check(in_place, [*named.causes, *lawful.causes], laws, tables, left_nm2, secants)
             named.causes = [check.of(cause) for cause in named.causes]
             if not any(one.reason for one in named.causes):
                 named.causes = [check.beside_table(check.beside_laws(one)) for one in named.causes]

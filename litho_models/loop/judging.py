@@ -102,8 +102,8 @@ def judge(
 
 def judge_states(before: State, after: State) -> Judgement:
     """Judge the change from one fitted model to another."""
-    evidence = np.array([*map(evidence_nm2, before.freed_um, after.freed_um)])
-    return judge(before.freed_nm2, after.freed_nm2, after.study, evidence)
+    evidence = map(evidence_nm2, before.freed_um, after.freed_um)
+    return judge(before.freed_nm2, after.freed_nm2, after.study, np.array([*evidence]))
 
 
 def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
@@ -116,15 +116,14 @@ def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
     return NM_PER_UM**2 * float(np.nanmean(before_um * (before_um - after_um)))
 
 
-def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
+def told_apart(before: State, best: State, other: State) -> bool:
     """Return whether another change of the model is clearly worse than the best change. Two conditions must
     hold: a sign-flip test over the scans shows that the other change is worse, and the gain of the other
     change is at most three quarters of the best gain.
 
     Args:
-        before_nm2, best_nm2, other_nm2: mean squared error of each scan before the change, after the best
-            change and after the other change, of shape (scans,).
-        study: the study, which provides the seed.
+        before: the model before the change.
+        best, other: the model after the best change, and the model after the other change.
     """
-    lost = judge(other_nm2, best_nm2, study)
-    return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())
+    lost = judge(other.freed_nm2, best.freed_nm2, before.study)
+    return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * (before.mse_nm2 - best.mse_nm2)

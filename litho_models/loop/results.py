@@ -14,7 +14,7 @@ from scipy.stats import t
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.effect import Knowledge
 from litho_models.fitting.least_squares import Linearised, eliminated
-from litho_models.loop.closing import Closed, survives_on
+from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES
 from litho_models.loop.judging import FAMILY_P, FEWEST_SCANS
 from litho_models.loop.model import Twin
@@ -55,7 +55,8 @@ def record(
         given: the remaining fields of the record.
     """
     study = closed.study
-    effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
+    found = [*closed.traced, *closed.described.causes]
+    effects = [_found(closed, one, left_out_nm[one.name]) for one in found]
     headline = {row.model: row.leading_by_scan_nm for row in errors if row.is_headline}
     gains = [headline["base"][scan.id] - headline["all"][scan.id] for scan in study.scans]
     return CloseLoop(
@@ -107,7 +108,7 @@ def _values(twin: Twin) -> dict[str, float]:
 def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     effect, judgement, names = get_effect(cause.name), cause.judgement, [cause.name, *cause.alike]
     role, *others = {get_effect(name).role for name in names}
-    knowledge, on = effect.knowledge, survives_on(cause, closed.rivals)
+    knowledge = effect.knowledge
     # If the search with another base does not find a cause, the cause may only correct an error of the chosen
     # base.
     if knowledge == "cause" and cause.role is None and not closed.needed_by_all(cause):
@@ -134,7 +135,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
         family_p=cause.family_p,
         group_p=cause.group_p,
         left_out_nm=left_out_nm,
-        survives_on=on,
+        survives_on=[name for name, rival in closed.rivals.items() if rival.has(cause)],
     )
 
 

@@ -11,9 +11,10 @@ inner products of the residual and the columns of each scan.
 from __future__ import annotations
 
 from collections import ChainMap, Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,12 @@ from numpy.typing import NDArray
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect
 from litho_models.effects.chain import Fields
-from litho_models.fitting.least_squares import gram_inside
+from litho_models.fitting.least_squares import gram
 from litho_models.loop.fits import State
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import ALL_FREE, PreparedScan
-from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
+from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import sign_flips
 
 # The scan terms and the changes that the model's own parameters can make are projected out of each column. An
@@ -45,12 +46,14 @@ class Trial:
     parameters and differ only in which amplitudes are switched on. A regression fits one factor per set,
     which multiplies the change that the set makes.
 
-    Each set gives one column of the regression. ``columns`` contains the numbers of these columns.
+    Each set gives one column of the regression. ``columns`` contains the numbers of these columns. If there
+    are no sets, the columns are the derivatives of the prediction with respect to the amplitudes of an effect
+    in the model, and the factors are not limited.
     """
 
     effect: Effect
     sets: tuple[Mapping[str, float], ...]
-    columns: list[int] = field(default_factory=list)
+    columns: list[int]
 
     @cached_property
     def _facts(self) -> np.ndarray:
@@ -60,12 +63,26 @@ class Trial:
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
+    def _distances(self, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
+        """Return the signed distance (step) of each amplitude from its null value in each parameter set. The
+        result has shape (sets, amplitudes).
+        """
+        nulls = {name: self.effect.parameters[name].null for name in self.effect.amplitudes}
+        return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
+
     def steps(self, multiples: np.ndarray) -> np.ndarray:
         """Return the signed distance (step) of each amplitude from its null value, after each parameter set
         has been multiplied by its factor in ``multiples``. ``multiples`` has shape (…, sets), and the result
         has shape (…, amplitudes).
         """
-        return multiples @ _steps(self.effect, self.sets)
+        return multiples @ self._distances(self.sets)
+
+    def _room(self, steps: np.ndarray) -> np.ndarray:
+        """Return the largest allowed step of each amplitude in the direction of the given step. It is zero if
+        this direction leads to the wrong side of the null value.
+        """
+        null, lower, upper, _ = self._facts
+        return np.where(steps > 0, upper, lower) - null
 
     def allowed(self, multiples: np.ndarray, axis: int | None = None) -> np.ndarray:
         """Return whether every amplitude lies on the allowed side of its null value after each parameter set
@@ -75,10 +92,10 @@ class Trial:
         An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude:
         the largest of its row if ``axis`` is -1, and otherwise the largest of all rows.
         """
-        (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
-        wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
-        sizes = np.abs(steps) / usual
-        return ~(wrong & (sizes > 0.3 * sizes.max(axis=axis, keepdims=True))).any(axis=axis)
+        steps = self.steps(multiples)
+        sizes = np.abs(steps) / self._facts[3]
+        large = sizes > 0.3 * sizes.max(axis=axis, keepdims=True)
+        return ~(large & (self._room(steps) == 0)).any(axis=axis)
 
     def reach(self, multiples: np.ndarray) -> np.ndarray:
         """For each row of ``multiples``, return the largest factor, at most 1, by which the steps of all
@@ -86,32 +103,23 @@ class Trial:
 
         The full steps may lead out of the ranges, because they are obtained by linear extrapolation.
         """
-        (null, lower, upper, _), steps = self._facts, self.steps(multiples)
-        room = np.where(steps > 0, upper, lower) - null
-        beyond = (np.abs(room) < np.abs(steps)) & (room != 0)
-        return np.divide(room, steps, out=np.ones_like(steps), where=beyond).min(axis=-1)
+        steps = self.steps(multiples)
+        room = self._room(steps)
+        return np.divide(room, steps, out=np.ones_like(steps), where=room * steps > 0).min(axis=-1, initial=1)
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
         """Return the parameter values from which a fit starts. No amplitude is farther from its null value
         than in the parameter sets that screening tries.
         """
         null, lower, upper, _ = self._facts
-        largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
+        largest = np.abs(self._distances(self.effect.trials)).max(axis=0)
         steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
         values = np.clip(null + steps, lower, upper).tolist()
         amplitudes = dict(zip(self.effect.amplitudes, values, strict=True))
         return self.effect.with_values({**self.sets[0], **amplitudes})
 
 
-def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """Return the signed distance (step) of each amplitude from its null value in each parameter set. The
-    result has shape (sets, amplitudes).
-    """
-    nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
-    return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
-
-
-def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
+def trials_of(effects: Sequence[Effect], first: int) -> list[Trial]:
     """Combine the parameter sets of the effects into trials. The columns are numbered from ``first``.
 
     The sets of a trial have the same values of the shape parameters. If the same amplitudes are tried at two
@@ -119,54 +127,45 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
     need not be a multiple of the change that a small effect makes.
     """
     found: list[Trial] = []
+    numbers = count(first)
     for effect in effects:
         sizes: Counter[object] = Counter()
         together: dict[object, list[Mapping[str, float]]] = {}
         for trial in effect.trials:
-            shape = tuple(sorted((k, v) for k, v in trial.items() if k not in effect.amplitudes))
+            shape = frozenset((k, v) for k, v in trial.items() if k not in effect.amplitudes)
             alike = shape, frozenset(trial)
             together.setdefault((shape, sizes[alike]), []).append(trial)
             sizes[alike] += 1
-        for own in together.values():
-            found.append(Trial(effect, tuple(own), list(range(first, first + len(own)))))
-            first += len(own)
+        found += [Trial(effect, tuple(own), [next(numbers) for _ in own]) for own in together.values()]
     return found
 
 
 class Secants:
-    """Compute the changes that trials make to the predictions of a given model in all windows, and cache
-    these changes.
+    """Compute the changes that trials make to the prediction of a given model in one window, and cache these
+    changes.
 
     Attributes:
-        free_terms: for each window, an orthonormal basis of the free scan terms at its n sampled pixels, of
-            shape (n, k).
+        free_terms: orthonormal basis of the free scan terms at the n sampled pixels, of shape (n, k).
     """
 
-    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
-        self._twin, self._windows = twin, windows
-        self._fields: list[Fields] = [{} for _ in windows]
-        self._heights_um = [
-            twin.height(one, known=known) for one, known in zip(windows, self._fields, strict=True)
-        ]
-        heights = zip(windows, self._heights_um, strict=True)
-        self.free_terms = [one.free_basis(height, ALL_FREE) for one, height in heights]
-        self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
+    def __init__(self, twin: Twin, window: PreparedScan):
+        fields: Fields = {}
+        height_um = twin.height(window, known=fields)
+        self.free_terms = window.free_basis(height_um, ALL_FREE)
 
-    def of(self, trials: Sequence[Trial]) -> list[list[NDArray[np.float32]]]:
-        """Return for each window a list of the changes that the parameter sets of all trials make to its
-        prediction. Each change is an array of shape (n,), µm.
+        @cache
+        def change_um(name: str, values: tuple[tuple[str, float], ...]) -> NDArray[np.float32]:
+            moved = twin.height(window, {name: dict(values)}, ChainMap({}, fields))
+            return window.at_sample(moved - height_um).astype(np.float32)
+
+        self._change_um = change_um
+
+    def of(self, trials: Sequence[Trial]) -> list[NDArray[np.float32]]:
+        """Return the changes that the parameter sets of all trials make to the prediction. Each change is an
+        array of shape (n,), µm.
         """
-        rows = []
-        for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
-            key = effect.name, *values.items()
-            if key not in self._known:
-                extra, changes = {effect.name: effect.with_values(values)}, []
-                for window, known, here in zip(self._windows, self._fields, self._heights_um, strict=True):
-                    moved = self._twin.height(window, extra, ChainMap({}, known))
-                    changes.append(window.at_sample(moved - here).astype(np.float32))
-                self._known[key] = changes
-            rows.append(self._known[key])
-        return [[row[at] for row in rows] for at in range(len(self._windows))]
+        pairs = ((trial.effect.name, own) for trial in trials for own in trial.sets)
+        return [self._change_um(name, tuple(own.items())) for name, own in pairs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +214,9 @@ class Screened:
 
     @property
     def numbers(self) -> int:
-        shapes = sum(facts.kind == "shape" for facts in self.trial.effect.parameters.values())
-        return len(self.trial.sets) * len(self.multiples) + shapes
+        return len(self.trial.columns) * len(self.multiples) + sum(
+            facts.kind == "shape" for facts in self.trial.effect.parameters.values()
+        )
 
     def start(self) -> dict[str, dict[str, float]]:
         """Return the parameter values from which a fit starts, keyed by group label."""
@@ -229,104 +229,86 @@ class Screening:
     Args:
         state: the fitted model.
         effects: the candidate effects, none of which is in the model.
-        secants: changes that the candidates make to the predictions of a similar model. If they are given,
-            they are used as approximations, and the changes of the predictions of the fitted model are not
-            computed.
-        beside_own: whether the changes that the model's own parameters can make are projected out of the
-            columns of the candidates.
+        secants: for each window, the changes that the candidates make to the prediction of a similar model.
+            If they are given, they are used as approximations, and the changes of the predictions of the
+            fitted model are not computed.
     """
 
     def __init__(
         self,
         state: State,
         effects: Sequence[Effect],
-        secants: Secants | None = None,
-        beside_own: bool = True,
+        secants: Sequence[Secants] | None = None,
     ):
         self.study, self._mse_nm2 = state.study, state.mse_nm2
         own = len(state.twin.vector)
         self.trials = trials_of(effects, 1 + own)
-        secants = secants or Secants(state.twin, self.study.windows)
-        parts = zip(state.held_out_um, state.linear, secants.of(self.trials), secants.free_terms, strict=True)
+        secants = secants or [Secants(state.twin, window) for window in self.study.windows]
         grams, raw = [], np.array(1e-300)
-        for left, part, rows, free in parts:
-            stacked = np.column_stack([left, *part.jacobian, *rows])
-            whole = stacked.T @ stacked / len(stacked)
-            grams.append(whole - gram_inside(stacked, free) / len(stacked))
-            raw = raw + np.diag(whole)
-        products = Products(np.stack(grams), self.study.groups)
-        self.freed = products.freed_of([Block((1 + i,)) for i in range(own) if beside_own]).grams
+        for left, part, changes in zip(state.held_out_um, state.linear, secants, strict=True):
+            stacked = np.column_stack([left, *part.jacobian, *changes.of(self.trials)])
+            grams.append(gram(stacked, changes.free_terms) / len(stacked))
+            raw = raw + np.square(stacked).mean(axis=0)
+        self._grams = np.stack(grams)
+        blocks = [Block((1 + i,)) for i in range(own)]
+        self._freed = Products(self._grams, self.study.groups).freed_of(blocks).grams
         self._beside_base, self._retained = (
-            np.einsum("sii->i", one) / raw for one in (products.grams, self.freed)
+            np.einsum("sii->i", one) / raw for one in (self._grams, self._freed)
         )
 
     @cached_property
-    def candidates(self) -> dict[str, dict[str, Screened]]:
-        """Return the best trial of each effect for each grouping. The result is keyed by the name of the
-        effect and then by the name of the grouping.
-        """
-        found: dict[str, dict[str, Screened]] = {}
-        for trial in self.trials:
-            own = found.setdefault(trial.effect.name, {})
-            for by, labels in self.study.groups.items():
-                multiples = self.strengths(labels, trial.columns)
-                one = Screened(
-                    trial=trial,
-                    by=by,
-                    gains_nm2=self.gains_by([labels], trial.columns, trial)[0],
-                    multiples=multiples,
-                    allowed=bool(trial.allowed(np.stack([*multiples.values()]))),
-                    retained=float(self._retained[trial.columns].max()),
-                    beside_base=float(self._beside_base[trial.columns].max()),
-                )
-                best = own.get(by)
-                if best is None or (one.allowed, one.gain_nm2) > (best.allowed, best.gain_nm2):
-                    own[by] = one
-        common = np.array([own[ALL].gains_nm2 for own in found.values()]).T
+    def candidates(self) -> list[Screened]:
+        """Return the best trial of each effect for each grouping."""
+        best: dict[tuple[str, str], Screened] = {}
+        for one in (self.screened(trial, by) for trial in self.trials for by in self.study.groups):
+            other = best.setdefault((one.name, one.by), one)
+            if (one.allowed, one.gain_nm2) > (other.allowed, other.gain_nm2):
+                best[one.name, one.by] = one
+        found = best.values()
+        common = np.array([one.gains_nm2 for one in found if one.by == ALL]).T
         largest = (sign_flips(len(common), self.study.seed) @ common).max(axis=1) if found else common
-
-        def judged(one: Screened) -> Screened:
-            reached = largest >= one.gains_nm2.sum() * (1 - 1e-9)
-            return replace(one, family_p=float(reached.mean()))
-
-        return {name: {by: judged(one) for by, one in own.items()} for name, own in found.items()}
+        return [
+            replace(one, family_p=float(np.mean(largest >= one.gains_nm2.sum() * (1 - 1e-9))))
+            for one in found
+        ]
 
     @property
     def common(self) -> dict[str, Screened]:
         """Return the best trial of each effect for a strength that is the same in all scans, keyed by the
         name of the effect.
         """
-        return {name: own[ALL] for name, own in self.candidates.items()}
+        return {one.name: one for one in self.candidates if one.by == ALL}
+
+    def screened(self, trial: Trial, by: str) -> Screened:
+        """Screen one trial with one grouping of the scans, without the p values."""
+        labels = np.array(self.study.groups[by])
+        fitted = _solved(self._products(trial), _beside(labels))
+        return Screened(
+            trial=trial,
+            by=by,
+            gains_nm2=self._gains(labels[None], trial)[0],
+            multiples=dict(zip(labels.tolist(), fitted, strict=True)),
+            allowed=not trial.sets or bool(trial.allowed(fitted)),
+            retained=float(self._retained[trial.columns].max()),
+            beside_base=float(self._beside_base[trial.columns].max()),
+        )
 
     def standing(self) -> list[Screened]:
         """Return the significant candidates, in order of decreasing gain. Each candidate has its best
         grouping, or ``all`` if its strength does not differ significantly between groups.
         """
-        standing = []
-        for own in self.candidates.values():
-            grouped = self._grouped(own)
-            chosen = grouped or own[ALL]
-            worth = chosen.gain_nm2 >= WORTH_FITTING * SMALLEST_SHARE * self._mse_nm2
-            if not chosen.allowed or chosen.retained < SMALLEST_RETAINED or not worth:
-                continue
-            if grouped or chosen.family_p <= FAMILY_P:
-                standing.append(chosen)
+        standing, least = [], SMALLEST_SHARE * self._mse_nm2
+        for name, common in self.common.items():
+            # Strengths that differ by group must gain more than one strength for all scans.
+            needed = max(common.gain_nm2, 0.0) + least
+            best = self.best_grouping(
+                [one for one in self.candidates if one.name == name and one.allowed and one.gain_nm2 > needed]
+            )
+            one = best or common
+            worth = one.gain_nm2 >= WORTH_FITTING * least and one.retained >= SMALLEST_RETAINED
+            if one.allowed and worth and (best or one.family_p <= FAMILY_P):
+                standing.append(one)
         return sorted(standing, key=lambda one: -one.gain_nm2)
-
-    def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Return the candidate with its best grouping of the scans. Return None if no grouping gives a
-        significantly larger gain than a strength that is the same in all scans.
-        """
-        least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
-        options = {
-            by: (one.gain_nm2, one.numbers)
-            for by, one in own.items()
-            if by != ALL and one.allowed and one.gain_nm2 > least
-        }
-        best = self.best_grouping(
-            options, lambda by, moved: self.gains_by(moved, own[by].trial.columns, own[by].trial)
-        )
-        return replace(own[best[0]], group_p=best[1]) if best else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
         """Return the cosine of the angle between the changes that two candidates make to the predictions. The
@@ -334,80 +316,70 @@ class Screening:
         """
         # The change that a candidate makes is a weighted sum of columns. ``factors`` contains the weights of
         # the columns in each scan.
-        factors = np.zeros((2, *self.freed.shape[:2]))
+        factors = np.zeros((2, *self._freed.shape[:2]))
         for own, one in zip(factors, (a, b), strict=True):
             own[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
-        inner = np.einsum("asi,sij,bsj->ab", factors, self.freed, factors, optimize=True)
+        inner = np.einsum("asi,sij,bsj->ab", factors, self._freed, factors, optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
-    def strengths(self, labels: Labels, columns: Sequence[int]) -> dict[str, np.ndarray]:
-        """Fit the strengths of the columns to all scans of each group. Return them keyed by group label."""
-        products, members = self._products(columns), np.array(labels)
-        return {one: _solved(products[members == one].sum(axis=0)) for one in dict.fromkeys(labels)}
+    def _products(self, trial: Trial) -> np.ndarray:
+        both = np.array([0, *trial.columns])
+        # The amplitudes of an effect in the model differ by group, and parameters that are the same in all
+        # scans cannot explain such a difference. The changes that they can make are not projected out.
+        return (self._freed if trial.sets else self._grams)[:, both[:, None], both]
 
-    def _products(self, columns: Sequence[int]) -> np.ndarray:
-        both = np.array([0, *columns])
-        return self.freed[:, both[:, None], both]
-
-    def gains_by(
-        self, groupings: Sequence[Labels] | np.ndarray, columns: Sequence[int], trial: Trial | None = None
-    ) -> np.ndarray:
-        """Return the gain of the given columns on each scan, nm², of shape (groupings, scans). The strengths
-        of the columns differ by label, and they are fitted without the fold of the scan.
+    def _gains(self, groupings: np.ndarray, trial: Trial) -> np.ndarray:
+        """Return the gain of a trial on each scan, nm², of shape (groupings, scans). The strengths of its
+        columns differ by label, and they are fitted without the fold of the scan. They are reduced so that
+        the amplitudes stay within their ranges. If a strength is not allowed, its gain is 0.
 
         Args:
-            groupings: one or more groupings, each with the label of each scan.
-            columns: numbers of the columns in the inner products.
-            trial: trial with these columns. If it is given, strengths are reduced so that its amplitudes stay
-                within their ranges. If a strength is not allowed, its gain is 0.
+            groupings: the label of each scan in one or more groupings, of shape (groupings, scans).
+            trial: the trial.
         """
-        products, labels, fold_of = self._products(columns), np.array(groupings), self.study.fold_of
+        products = self._products(trial)
         # The strengths for a scan are fitted to the scans with the same label in other folds. If there are no
         # such scans, the scan gains nothing.
-        fitted_to = _beside(labels) & ~_beside(fold_of)
-        found = _solved(np.tensordot(fitted_to, products, 1))
-        if trial:
+        found = _solved(products, _beside(groupings) & ~_beside(self.study.fold_of))
+        if trial.sets:
             found *= (trial.allowed(found, -1) * trial.reach(found))[..., None]
         gains = found * (2 * products[:, 0, 1:] - np.einsum("sij,gsj->gsi", products[:, 1:, 1:], found))
         return gains.sum(axis=-1) * NM_PER_UM**2
 
-    def best_grouping(
-        self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, np.ndarray], np.ndarray]
-    ) -> tuple[str, float] | None:
+    def best_grouping(self, options: Sequence[Screened]) -> Screened | None:
         """Choose the grouping of the scans for a candidate whose strengths differ between groups. Only
         groupings with nearly the largest gain are considered. Of these, the grouping with the fewest
         parameters is chosen.
 
         Args:
-            options: gain in nm² and number of parameters of each grouping, keyed by the name of the grouping.
-            gains_of: function ``gains_of(by, moved)`` that returns gains for the permutation test, nm², of
-                shape (groupings, scans). In each row, the strengths of the candidate that was found for the
-                grouping ``by`` differ by one of the permuted groupings ``moved`` instead.
+            options: the candidate with each of the groupings.
 
         Returns:
-            The name of the chosen grouping, and its p value. The p value is the fraction of random
-            permutations of the scans in which the gain with at least one grouping reaches the gain with the
-            chosen grouping. Permutations that reproduce the chosen grouping are not counted. The result is
-            None if no grouping has a gain, or if the gain of the chosen grouping is not significant.
+            The candidate with the chosen grouping and the p value of this grouping. The p value is the
+            fraction of random permutations of the scans in which the gain with at least one grouping reaches
+            the gain with the chosen grouping. Permutations that reproduce the chosen grouping are not
+            counted. The result is None if no grouping has a gain, or if the gain of the chosen grouping is
+            not significant.
         """
-        most = max((gain for gain, _ in options.values()), default=0.0)
-        close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}
+        most = max((one.gain_nm2 for one in options), default=0.0)
+        close = [one for one in options if one.gain_nm2 >= 0.95 * most > 0]
         if not close:
             return None
-        best = min(close, key=lambda by: close[by])
-        groupings = np.array([labels for by, labels in self.study.groups.items() if by != ALL])
-        rng, judged = np.random.default_rng(self.study.seed), _beside(np.array(self.study.groups[best]))
+        best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
+        # The first grouping is ``all``.
+        groupings = np.array([*self.study.groups.values()][1:])
+        rng, judged = np.random.default_rng(self.study.seed), _beside(np.array(self.study.groups[best.by]))
         exchanged = beaten = 1
         for _ in range(PERMUTATIONS):
             moved = groupings[:, rng.permutation(len(self.study.scans))]
             if not (_beside(moved) == judged).all(axis=(1, 2)).any():
                 exchanged += 1
-                gained = gains_of(best, moved).mean(axis=1).max()
-                beaten += int(gained >= options[best][0] * (1 - 1e-12))
+                gained = self._gains(moved, best.trial).mean(axis=1).max()
+                beaten += int(gained >= best.gain_nm2 * (1 - 1e-12))
                 if beaten > EXCHANGED_P * (1 + PERMUTATIONS):
                     return None
         p = beaten / exchanged
-        return (best, p) if p <= EXCHANGED_P else None
+        return replace(best, group_p=p) if p <= EXCHANGED_P else None
 
 
 def _beside(labels: np.ndarray) -> np.ndarray:
@@ -415,6 +387,15 @@ def _beside(labels: np.ndarray) -> np.ndarray:
     return labels[..., :, None] == labels[..., None, :]
 
 
-def _solved(products: np.ndarray) -> np.ndarray:
-    inverse = np.linalg.pinv(products[..., 1:, 1:], rcond=1e-8, hermitian=True)
-    return (inverse @ products[..., 1:, :1])[..., 0]
+def _solved(products: np.ndarray, fitted_to: np.ndarray) -> np.ndarray:
+    """Fit strengths for each scan to other scans, and return them, of shape (…, scans, columns).
+
+    Args:
+        products: inner products of the residual and the columns in each scan, of shape (scans, 1 + columns, 1
+            + columns).
+        fitted_to: for each scan, the mask of the scans to which its strengths are fitted, of shape (…, scans,
+            scans).
+    """
+    summed = np.tensordot(fitted_to, products, 1)
+    inverse = np.linalg.pinv(summed[..., 1:, 1:], rcond=1e-8, hermitian=True)
+    return (inverse @ summed[..., 1:, :1])[..., 0]

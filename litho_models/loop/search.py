@@ -15,12 +15,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from litho_data.sharing.workers import run_jobs
-from litho_models.effects import CATALOGUE, Effect, get_effect
+from litho_models.effects import Effect, get_effect, screened_effects
 from litho_models.effects.effect import Role
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import GROUPED_P, Judgement, judge, judge_states, told_apart
-from litho_models.loop.model import Twin, Values
-from litho_models.loop.screening import Screened, Screening, Secants
+from litho_models.loop.model import Slot, Twin, Values
+from litho_models.loop.screening import Screened, Screening, Secants, Trial
 from litho_models.scan_terms.grouped import ALL
 
 # Two effects count as indistinguishable if the cosine between the changes that they make to the predictions
@@ -82,16 +82,17 @@ class Found:
     refused: dict[str, str] = field(default_factory=dict)
     failed: list[Cause] = field(default_factory=list)
 
-    @property
-    def names(self) -> list[str]:
-        return [cause.name for cause in self.causes]
+    def has(self, cause: Cause) -> bool:
+        """Return whether the search has found a cause, or an effect that looks the same."""
+        alike = {cause.name, *cause.alike, *cause.excluded}
+        return any(alike & {one.name, *one.alike} for one in self.causes)
 
 
 def search(
     start: State,
     candidates: Sequence[Effect],
     most: int = 8,
-    secants: Secants | None = None,
+    secants: Sequence[Secants] | None = None,
     seed: Found | None = None,
 ) -> Found:
     """Add effects to a fitted model as long as held-out scans confirm them.
@@ -100,17 +101,17 @@ def search(
         start: the fitted model.
         candidates: effects that may be added.
         most: largest number of effects in the result.
-        secants: changes that the candidates make to the predictions of a similar model. If they are given,
-            they are used as approximations, and the changes of the predictions of the current model are not
-            computed.
+        secants: for each window, the changes that the candidates make to the prediction of a similar model.
+            If they are given, they are used as approximations, and the changes of the predictions of the
+            current model are not computed.
         seed: result of the same search with another base model. If it is given, the effects that it contains
             are first tested in the model ``start``. The search continues from those effects that held-out
             scans confirm.
     """
     found = Found(start)
     if seed and seed.causes:
-        twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
-        found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
+        twin = replace(start.twin, effects=seed.state.twin.effects)
+        found = Found(fit_state(twin, start.study), list(seed.causes), seed.first)
         _test_again(found)
     while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
@@ -119,7 +120,7 @@ def search(
 
 
 def describe(
-    state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
+    state: State, tables: Sequence[Effect], most: int, secants: Sequence[Secants] | None = None
 ) -> list[Cause]:
     """Return the tables that held-out scans confirm as an improvement of a model. Each table is judged alone,
     by a linear fit, and is not added to the model. At most ``most`` tables are judged.
@@ -134,11 +135,10 @@ def describe(
 
 def with_table(state: State, table: Cause) -> State:
     """Add an effect from ``TABLES`` to a model, and refit all parameters of the model."""
-    twin = state.twin.with_effect(table.name, table.by, table.values)
-    return fit_state(twin, state.study, from_here=True)
+    return fit_state(state.twin.with_effect(table.name, table.by, table.values), state.study, from_here=True)
 
 
-def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None) -> bool:
+def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secants] | None) -> bool:
     study = found.state.study
     effects = [one for one in candidates if one.name not in found.state.twin.names]
     if not effects:
@@ -149,9 +149,9 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
     study.report(f"{len(left)} of {len(effects)} candidates are significant")
     while left:
         best = left[0]
-        # Up to three candidates that make a similar change are fitted together with the best candidate.
-        near = (one for one in left[1:] if one.gain_nm2 >= 0.3 * best.gain_nm2)
-        entering = [best, *[one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]]
+        # The best candidate and up to three candidates that make a similar change are fitted.
+        near = (one for one in left if one.gain_nm2 >= 0.3 * best.gain_nm2)
+        entering = [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:4]
         left = [one for one in left if one not in entering]
         fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
@@ -163,50 +163,40 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
             found.causes.append(Cause(one.name, one.by, alike, judgement, one.family_p, one.group_p))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
-            _regroup(found, one.name)
+            _regroup(found, -1)
             gained = f"{judgement.gain_nm2:.0f} of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: it removes {gained}")
             return True
     return False
 
 
-def _regroup(found: Found, name: str) -> None:
-    """Let the strength of a cause differ by group if held-out scans confirm that it does.
+def _regroup(found: Found, number: int) -> None:
+    """Let the strength of a cause differ by group if held-out scans confirm that it does. ``number`` is the
+    index of the cause in ``found.causes``.
 
     Screening has already tried strengths that differ by group. This second test is more reliable, because it
     uses the derivative of the prediction at the fitted strength of the cause.
     """
-    twin, study = found.state.twin, found.state.study
-    at_cause = found.names.index(name)
-    cause = found.causes[at_cause]
+    cause, twin, study = found.causes[number], found.state.twin, found.state.study
     if cause.by != ALL:
         return
-    slots = {
-        1 + at: slot
-        for at, slot in enumerate(twin.slots, twin.own)
-        if slot.effect == name and slot.facts.kind == "amplitude"
-    }
-    # Parameters that are the same in all scans cannot explain a difference between groups, so the changes
-    # that they can make are not projected out.
-    screening = Screening(found.state, (), beside_own=False)
-    gained = zip(study.groups, screening.gains_by([*study.groups.values()], [*slots]), strict=True)
-    best = screening.best_grouping(
-        {by: (float(gains.mean()), len(set(study.groups[by]))) for by, gains in gained if by != ALL},
-        lambda _, moved: screening.gains_by(moved, [*slots]),
-    )
-    if best is None:
+    effect = get_effect(cause.name)
+    at = [twin.own + twin.slots.index(Slot(effect.name, name)) for name in effect.amplitudes]
+    trial = Trial(effect, (), [1 + one for one in at])
+    screening = Screening(found.state, ())
+    best = screening.best_grouping([screening.screened(trial, by) for by in study.groups if by != ALL])
+    if not best:
         return
-    by, p = best
-    known, starts = twin.values()[name], {}
-    for label, steps in screening.strengths(study.groups[by], [*slots]).items():
-        starts[label] = dict(known)
-        for slot, step in zip(slots.values(), steps.tolist(), strict=True):
-            moved = known[slot.parameter] + step
-            starts[label][slot.parameter] = min(max(moved, slot.facts.lower), slot.facts.upper)
-    state = fit_state(twin.without(name).with_effect(name, by, starts), study, from_here=True)
+    starts, room = {}, [limits[at] for limits in twin.room()]
+    for label, steps in best.multiples.items():
+        vector = twin.vector.copy()
+        vector[at] += np.clip(steps, *room)
+        starts[label] = twin.at(vector).values()[effect.name]
+    twin = twin.without(effect.name).with_effect(effect.name, best.by, starts)
+    state = fit_state(twin, study, from_here=True)
     if judge_states(found.state, state).p <= GROUPED_P:
-        study.report(f"the strength of {name} differs by {by}")
-        found.causes[at_cause] = replace(cause, by=by, group_p=p)
+        study.report(f"the strength of {effect.name} differs by {best.by}")
+        found.causes[number] = replace(cause, by=best.by, group_p=best.group_p)
         found.state = state
 
 
@@ -220,15 +210,14 @@ def _alike(
     by_fit = [
         name
         for name, other in sorted(fitted.items(), key=lambda pair: pair[1].mse_nm2)
-        if name != one.name
-        and same_change(before, own, other)
-        and not told_apart(before.freed_nm2, own.freed_nm2, other.freed_nm2, before.study)
+        if name != one.name and same_change(before, own, other) and not told_apart(before, own, other)
     ]
-    others = (by[one.by] for name, by in screening.candidates.items() if name not in fitted)
     by_screening = [
         other.name
-        for other in sorted(others, key=lambda other: -other.gain_nm2)
-        if other.allowed
+        for other in sorted(screening.candidates, key=lambda other: -other.gain_nm2)
+        if other.by == one.by
+        and other.name not in fitted
+        and other.allowed
         and other.gain_nm2 >= 0.5 * one.gain_nm2
         and abs(screening.cosine(one, other)) >= SAME_COSINE
     ]
@@ -255,12 +244,13 @@ def same_change(before: State, one: State, other: State) -> bool:
         before: the model before the change.
         one, other: the model after the first change, and the model after the second change.
     """
-    inner = np.zeros((2, 2))
-    for old, a, b in zip(before.held_out_um, one.held_out_um, other.held_out_um, strict=True):
-        changes = np.stack([old - a, old - b])
-        changes -= changes.mean(axis=1, keepdims=True)
-        inner += changes @ changes.T
-    return bool(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300) >= SAME_COSINE)
+
+    def change(after: State) -> np.ndarray:
+        parts = map(np.subtract, before.held_out_um, after.held_out_um)
+        return np.concatenate([part - part.mean() for part in parts])
+
+    a, b = change(one), change(other)
+    return bool(a @ b > SAME_COSINE * np.linalg.norm(a) * np.linalg.norm(b))
 
 
 def _defend(found: Found) -> None:
@@ -268,8 +258,8 @@ def _defend(found: Found) -> None:
     visible only when the other causes are in the model. Then test each cause again.
     """
     if len(found.causes) > 1:
-        for name in found.names:
-            _regroup(found, name)
+        for number in range(len(found.causes)):
+            _regroup(found, number)
         _test_again(found)
 
 
@@ -294,9 +284,7 @@ def untestable(study: Study) -> dict[str, str]:
     """Return the effects that cannot be tested with these scans, each with the reason."""
     reasons = {}
     one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
-    for effect in CATALOGUE.values():
-        if effect.per_scan:
-            continue
+    for effect in screened_effects():
         if one_level:
             reasons[effect.name] = "every layout has only one level, so nothing in the print varies"
         elif "order" in effect.needs and len({scan.context.order for scan in study.scans}) < 3:
@@ -308,5 +296,4 @@ def untestable(study: Study) -> dict[str, str]:
 
 def separating(names: Sequence[str]) -> str:
     """Return the experiments that would distinguish the named effects, in words."""
-    texts = dict.fromkeys(get_effect(name).separating for name in names)
-    return "; ".join(text for text in texts if text)
+    return "; ".join(filter(None, dict.fromkeys(get_effect(name).separating for name in names)))

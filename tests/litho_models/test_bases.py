@@ -158,7 +158,7 @@ def test_the_search_adds_a_law_that_a_trained_model_lacks_and_none_that_it_has()
     for base, names in ((base_model().requires_grad_(False), [LAW]), (Carrying(), [])):
         start = fit_state(Twin.bare(base), study)
         found = search(start, [get_effect(LAW), get_effect("height-power-2")])
-        assert found.names == names
+        assert [one.name for one in found.causes] == names
         assert found.state.twin.own == 0
         # The residual is the white noise of 4 nm.
         assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.05)

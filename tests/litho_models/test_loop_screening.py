@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -24,7 +22,7 @@ def screened(by: str, *strengths: float) -> tuple[Study, State, dict[tuple[str, 
     study = study_of(planted([(LAW, by, values)]))
     state = bare_state(study)
     screening = Screening(state, EFFECTS)
-    found = {(name, by): one for name, own in screening.candidates.items() for by, one in own.items()}
+    found = {(one.name, one.by): one for one in screening.candidates}
     return study, state, found, screening
 
 
@@ -74,12 +72,7 @@ def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
     for (name, by), other in found.items():
         if name == LAW and by != ALL:
             assert other.gain_nm2 < 1.02 * one.gain_nm2
-            gains_of = partial(_gains_of, screening, other)
-            assert screening.best_grouping({by: (other.gain_nm2, 1)}, gains_of) is None
-
-
-def _gains_of(screening: Screening, one: Screened, by: str, moved: np.ndarray) -> np.ndarray:
-    return screening.gains_by(moved, one.trial.columns)
+            assert screening.best_grouping([other]) is None
 
 
 def test_a_candidate_is_wholly_like_itself_and_its_opposite(in_all) -> None:
@@ -140,7 +133,7 @@ def test_trials_of_one_shape_and_size_are_fitted_together() -> None:
 
 
 def test_multiples_count_from_the_null_and_stay_in_range() -> None:
-    trial = Trial(_effect(), _effect().trials[:2])
+    trial = Trial(_effect(), _effect().trials[:2], [])
     assert trial.steps(np.array([2.0, 3.0])) == pytest.approx([0.2, 0.6])
     assert trial.reach(np.array([2.0, 3.0])) == 1
     # Here a would be 2, which is twice its upper bound.
@@ -150,7 +143,7 @@ def test_multiples_count_from_the_null_and_stay_in_range() -> None:
 
 
 def test_an_impossible_sign_is_allowed_only_for_a_relatively_small_strength() -> None:
-    trial = Trial(_effect(), _effect().trials[:2])
+    trial = Trial(_effect(), _effect().trials[:2], [])
     assert trial.allowed(np.array([1.0, 1.0]))
     assert not trial.allowed(np.array([-1.0, 0.0]))
     assert not trial.allowed(np.array([-1.0, 1.0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_what_only_a_table_describes_enters_the_corrected_model() -> None:
     study = study_of(planted([("level-table", ALL, {"": strengths})]))
     state = bare_state(study)
     found = _in_model(state, describe(state, [table], 1))
-    assert found.names == ["level-table"]
+    assert added(found) == {"level-table": ALL}
     assert state.mse_nm2 > 2 * found.state.mse_nm2
     # The residual is the noise.
     assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
@@ -141,14 +142,14 @@ def test_two_causes_are_found_together_each_with_its_grouping() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_found_in_noise(seed: int) -> None:
     found = found_in(seed=seed)
-    assert found.names == []
+    assert found.causes == []
     assert found.state.twin.names == ()
     assert set(found.first) == {effect.name for effect in CANDIDATES}
 
 
 def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
     found = found_in((THINNING, ALL, {"": thinning(0.2)}), count=FEWEST_SCANS - 2)
-    assert found.names == []
+    assert found.causes == []
     assert found.refused[THINNING].startswith(f"{FEWEST_SCANS - 2} scans are too few")
 
 
@@ -182,13 +183,13 @@ def test_a_cause_that_another_resembles_is_found(
     study = study_of(scans)
     start = fit_state(Twin.bare(build_model("physics")), study)
     found = search(start, [effect, *map(get_effect, beside)])
-    assert found.names == [name]
+    assert added(found) == {name: ALL}
     assert found.causes[0].alike == ()
 
 
 def test_no_more_effects_than_asked_for() -> None:
     study = study_of(planted([(THINNING, ALL, {"": thinning(0.15)})]))
-    assert search(bare_state(study), CANDIDATES, most=0).names == []
+    assert search(bare_state(study), CANDIDATES, most=0).causes == []
 
 
 def test_a_change_is_the_same_as_itself_scaled_and_no_other() -> None:
@@ -261,13 +262,18 @@ def test_a_gain_matters_from_two_percent_of_the_squared_error() -> None:
     assert "too small to matter" in judge(before, before - 7.9, STUDY).reason()
 
 
+def leaving(squares_nm2: np.ndarray) -> SimpleNamespace:
+    """Return a model with these squared errors."""
+    return SimpleNamespace(freed_nm2=squares_nm2, mse_nm2=squares_nm2.mean(), study=STUDY)
+
+
 def test_a_rival_is_told_apart_by_a_quarter_of_the_gain_in_all_scans() -> None:
-    before, best = np.full(10, 100.0), np.full(10, 60.0)
-    assert told_apart(before, best, np.full(10, 71.0), STUDY)
-    assert not told_apart(before, best, np.full(10, 69.0), STUDY)
-    mixed = best + np.where(np.arange(10) % 3, 20.0, -20.0)
-    assert judge(mixed, best, STUDY).p > CONFIRM_P
-    assert not told_apart(before, best, mixed, STUDY)
+    before, best = leaving(np.full(10, 100.0)), leaving(np.full(10, 60.0))
+    assert told_apart(before, best, leaving(np.full(10, 71.0)))
+    assert not told_apart(before, best, leaving(np.full(10, 69.0)))
+    mixed = best.freed_nm2 + np.where(np.arange(10) % 3, 20.0, -20.0)
+    assert judge(mixed, best.freed_nm2, STUDY).p > CONFIRM_P
+    assert not told_apart(before, best, leaving(mixed))
 
 
 def test_what_scans_cannot_test_is_said_before_any_fit() -> None:

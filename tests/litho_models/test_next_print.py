@@ -911,7 +911,7 @@ def test_an_excluded_cause_makes_way_for_the_one_that_remains() -> None:
     after = with_decisions(before, *decided_for("layer-stacking", among=rivals))
     assert after.final.twin.names == after.named.state.twin.names == ("layer-stacking",)
     assert before.final.twin.names == ("slope-thinning",)
-    [found] = [_found(after, one, 0.0) for one in after.found]
+    [found] = [_found(after, one, 0.0) for one in after.traced]
     assert (found.name, found.role, found.verdict) == ("layer-stacking", "process", "explained")
     assert found.confusable_with == []
     # The fitted value is that of these scans and not that of the rival.
@@ -923,7 +923,7 @@ def test_an_excluded_cause_makes_way_for_the_one_that_remains() -> None:
         assert told[name].reason == "later prints exclude it: layer-stacking fits them better"
     # Two effects remain.
     after = with_decisions(before, *decided_for("layer-stacking", "diffusion-blur", among=rivals))
-    [found] = [_found(after, one, 0.0) for one in after.found]
+    [found] = [_found(after, one, 0.0) for one in after.traced]
     assert (found.name, found.verdict) == ("layer-stacking", "confusable")
     assert found.confusable_with == ["diffusion-blur"]
     assert after.final.twin.names == ("layer-stacking",)
@@ -933,7 +933,7 @@ def test_an_excluded_cause_makes_way_for_the_one_that_remains() -> None:
         one.model_copy(update={"question": "a or b"}) for one in decided_for("layer-stacking", among=[])[1]
     ]
     after = with_decisions(before, suspects, decisions)
-    assert [one.name for one in after.found] == ["slope-thinning", "layer-stacking"]
+    assert [one.name for one in after.traced] == ["slope-thinning", "layer-stacking"]
     assert set(after.final.twin.names) == {"slope-thinning", "layer-stacking"}
 
 
