@@ -99,7 +99,7 @@ def causes_table(result: CloseLoop) -> str:
                 f"`{one.name}`{' (described)' if one.knowledge == 'description' else ''}",
                 one.by,
                 "<br>".join(_sizes(one)),
-                "–" if one.left_out_nm is None else f"{one.left_out_nm:+.2f} nm",
+                f"{one.left_out_nm:+.2f} nm",
                 "{} of {}".format(*one.scans_improved),
                 ", ".join(one.confusable_with) or "–",
                 ", ".join(one.survives_on) or "–",

@@ -5,7 +5,6 @@ The paper says that the roughness of its flat print is line-shaped and not perio
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict
 
 import numpy as np
 
@@ -115,7 +114,13 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
     shares = [own.var() / all_of_it for own, all_of_it in zip(means, variances, strict=True) if all_of_it > 0]
     period = None
     if found := line_period(means, pitch_um):
-        period = Period(**asdict(found), amplitude_nm=NM_PER_UM * found.amplitude_um)
+        period = Period(
+            period_um=found.period_um,
+            share=found.share,
+            p=found.p,
+            amplitude_nm=NM_PER_UM * found.amplitude_um,
+            coherence=found.coherence,
+        )
     return Lines(along=along, share=float(np.mean(shares)) if shares else 0.0, period=period)
 
 
