@@ -180,15 +180,16 @@ def with_answer(
         values: starting values of the parameters of the effect.
         known: the fields ``alike``, ``excluded`` and ``role`` of the new `Cause`.
     """
+    same = cause is not None and cause.name == name
 
     @cache
     def fitted(state: State) -> State:
-        if cause and (cause.name == name or cause.name not in state.twin.names):
+        if same or (cause and cause.name not in state.twin.names):
             return state
-        twin = state.twin.without(cause.name if cause else "")
+        twin = state.twin.without(cause.name) if cause else state.twin
         return fit_state(twin.with_effect(name, ALL, {"": values}), state.study)
 
-    if cause and cause.name == name:
+    if cause and same:
         answer = replace(cause, **known)
     else:
         final = fitted(closed.final)

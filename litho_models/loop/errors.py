@@ -204,8 +204,8 @@ class HeldOut:
         self, state: State, refit: bool = True, by: Parts = "folds"
     ) -> tuple[Maps, tuple[int, int]]:
         """Predict each scan by a fit to the scans outside its fold (or to the scans of all other prints).
-        Return the predicted maps, and the numbers of parameters of the printer model and the measurement
-        model in the largest fit.
+        Return the predicted maps, and two numbers of parameters: those of the printer model, and those of the
+        measurement model in the fit where they are largest.
 
         Args:
             state: the model from which the fits start.
@@ -218,10 +218,10 @@ class HeldOut:
             partial(fit_with_measurement, twin, [study.scans[i] for i in rest], study.seed, refit)
             for twin, (rest, _) in zip(starts, study.folds, strict=True)
         ]
-        done = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by} {jobs.index(job)}"))
+        done = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}"))
         fits = [done[job] for job in jobs]
-        pairs = zip(study.scans, study.fold_of, strict=True)
-        return [fits[fold].expected_um(scan) for scan, fold in pairs], max(fit.numbers for fit in fits)
+        maps = [fits[at].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
+        return maps, (len(state.twin.vector), max(fit.measurement.numbers for fit in fits))
 
     def _published(self, plain: State, maps: Maps) -> Maps:
         """Add to each predicted map a smooth background, which is learned from the scans of the other folds.

@@ -47,7 +47,8 @@ class Study:
 
     Attributes:
         scans: the prepared scans.
-        fold_of: number of the fold of each scan, of shape (scans,).
+        fold_of: number of the fold of each scan, of shape (scans,). The folds are numbered from 0 without
+            gaps.
         seed: seed of the folds, the calibration blocks and the permutations.
         workers: pool of processes for independent fits.
         report: function that receives the progress messages.
@@ -260,6 +261,8 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     if not (twin.own and twin.slots and isinstance(base, Simulator)):
         return twin.vector
     unfitted = replace(twin, numbers=Twin.bare(type(base)(base.config)).numbers)
+    if np.array_equal(unfitted.numbers, twin.numbers):
+        return twin.vector
     # Every third scan is enough to come close to the optimum.
     some = TwinProblem(twin, windows[::3] if len(windows) > 6 else windows)
     fits = [fit_least_squares(some, start.vector, RULES) for start in (twin, unfitted)]

@@ -52,25 +52,25 @@ class Rest:
         return float(self.gains_nm2.mean())
 
     @cached_property
-    def ci95_nm2(self) -> tuple[float, float]:
-        """Return the 95 % confidence interval of the mean of ``gains_nm2``. Fewer than six scans are too few
-        for a confidence interval. In this case, return 0 and the mean.
+    def limits_nm2(self) -> tuple[float, float]:
+        """Return the limits of the 95 % confidence interval of the mean of ``gains_nm2``. With fewer than six
+        scans, there is no such interval, and the result is 0 and the mean.
         """
         return interval(self.gains_nm2.tolist()) or (0.0, self.mean_nm2)
 
     @property
     def most_nm(self) -> float:
         """Return an upper bound on the rms error that inexact formulas of the model cause, nm. The bound is
-        the square root of the upper end of ``ci95_nm2``.
+        the square root of the upper end of ``limits_nm2``.
         """
-        return float(np.sqrt(max(self.ci95_nm2[1], 0.0)))
+        return float(np.sqrt(max(self.limits_nm2[1], 0.0)))
 
     @property
     def matters(self) -> bool:
         """Return whether a relevant part of the residual can be learned. This is the case if the ridge
-        regression explains more than 1 % of the squared error and the interval ``ci95_nm2`` lies above zero.
+        regression explains more than 1 % of the squared error and both ``limits_nm2`` lie above zero.
         """
-        return self.mean_nm2 > SMALLEST_SHARE * float(self.squares_nm2.mean()) and self.ci95_nm2[0] > 0
+        return self.mean_nm2 > SMALLEST_SHARE * float(self.squares_nm2.mean()) and self.limits_nm2[0] > 0
 
 
 class Learner:

@@ -140,7 +140,7 @@ class Twin:
             for key, facts in get_effect(name).parameters.items()
             for label in sorted(values)
         }
-        return replace(self, effects={**self.effects, **added})
+        return replace(self, effects={**self.without(name).effects, **added})
 
     def without(self, name: str) -> Twin:
         """Return the twin without the named effect."""
@@ -255,7 +255,7 @@ class Twin:
         for slot in self.slots:
             facts = slot.facts
             counts = kind == "amplitude" or facts.unit in ("µm", "px")
-            limits = [*{facts.lower, facts.upper} - {facts.null}]
+            limits = [*{facts.lower, facts.upper} - ({facts.null} if kind == "amplitude" else set())]
             at_limit = np.isclose(self.effects[slot], limits, _AT_BOUND, _AT_BOUND).any()
             if slot.effect == name and facts.kind == kind and counts and at_limit:
                 found.append(slot.parameter)

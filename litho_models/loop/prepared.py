@@ -174,7 +174,7 @@ def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = 
 
     Args:
         scans: the scans. Their positions in the writing order are scaled so that they run from -0.5 (first of
-            these scans) to 0.5 (last).
+            these scans) to 0.5 (last). Scans with the same position get the same value.
         known: scans that have already been prepared. If they are given, the position of each scan is instead
             interpolated between their scaled positions, so that the positions of all scans have the same
             scale.

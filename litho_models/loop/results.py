@@ -147,17 +147,19 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """
     twin, scans = closed.final.twin, closed.study.scans
     kinds = independent(scans), [scan.id for scan in scans]
+    variances = [np.diag(clustered_covariance(closed.final.linear, units)) for units in kinds]
     found = dict[str, list[Strength]]()
     for at, slot in enumerate(twin.slots, twin.own):
         if slot.effect == name:
             own = [*map(slot.is_of, scans)]
             # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single
             # unit would be zero and would show no scatter.
-            units = next((units for units in kinds if len({*compress(units, own)}) > 1), [])
-            variance = clustered_covariance(closed.final.linear, units)[at, at] if units else 0.0
-            value, unit = float(twin.vector[at]), slot.facts.unit
-            ci95 = t.interval(0.95, len({*units}) - 1, value, np.sqrt(variance)) if variance > 0 else None
-            strength = Strength(label=slot.label, value=value, unit=unit, ci95=ci95)
+            pairs = zip(kinds, variances, strict=True)
+            known = next((pair for pair in pairs if len({*compress(pair[0], own)}) > 1), None)
+            value, ci95 = float(twin.vector[at]), None
+            if known and known[1][at] > 0:
+                ci95 = t.interval(0.95, len({*known[0]}) - 1, value, np.sqrt(known[1][at]))
+            strength = Strength(label=slot.label, value=value, unit=slot.facts.unit, ci95=ci95)
             found.setdefault(slot.parameter, []).append(strength)
     # Choices are not fitted.
     for key, value in twin.values()[name].items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,9 @@ def close_loop(
     usable, dropped = measured_scans(opened)
     locked = [scan for scan in usable if scan.id in opened.locked_ids]
     development = [scan for scan in usable if scan.id not in opened.locked_ids]
+    if nested == "prints" and len({scan.print_id for scan in development}) < 2:
+        raise InputError("--nested prints", got="scans of one print", wanted="scans of at least 2 prints")
+    study = Study.dealt(development, folds, seed, report=report)
     settings = {
         "base": base, "base_settings": dict(base_settings), "folds": folds, "nested": nested,
         "inject": list(inject), "steps": steps,
@@ -114,15 +118,13 @@ def close_loop(
         whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,
     ):
-        study = Study.dealt(development, folds, seed, places, report)
+        study = replace(study, workers=places)
         kept = Path(cache or f"{out}-cache")
         bases = bases_for(base, study, steps=steps, cache=kept, fields=base_settings)
         if nested and not all(map(is_refitted, bases.values())):
             raise InputError(
                 f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
             )
-        if nested == "prints" and len({scan.print_id for scan in development}) < 2:
-            raise InputError("--nested prints", got="scans of one print", wanted="scans of at least 2 prints")
         closed = close(study, bases)
 
         def close_again(among: Mapping[str, nn.Module], scans: Sequence[PrintedScan]) -> Closed:

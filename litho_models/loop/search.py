@@ -149,9 +149,9 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secan
     study.report(f"{len(left)} of {len(effects)} candidates are significant")
     while left:
         best = left[0]
-        # The best candidate and up to three candidates that make a similar change are fitted.
-        near = (one for one in left if one.gain_nm2 >= 0.3 * best.gain_nm2)
-        entering = [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:4]
+        # Up to three candidates that make a similar change are fitted together with the best candidate.
+        near = (one for one in left[1:] if one.gain_nm2 >= 0.3 * best.gain_nm2)
+        entering = [best, *(one for one in near if abs(screening.cosine(best, one)) >= 0.5)][:4]
         left = [one for one in left if one not in entering]
         fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
@@ -283,12 +283,17 @@ def _test_again(found: Found) -> None:
 def untestable(study: Study) -> dict[str, str]:
     """Return the effects that cannot be tested with these scans, each with the reason."""
     reasons = {}
+    positions = len({scan.context.order for scan in study.scans})
     one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
     for effect in screened_effects():
         if one_level:
             reasons[effect.name] = "every layout has only one level, so nothing in the print varies"
-        elif "order" in effect.needs and len({scan.context.order for scan in study.scans}) < 3:
-            reasons[effect.name] = "the writing order of the scans is not known"
+        elif "order" in effect.needs and positions < 3:
+            reasons[effect.name] = (
+                "the writing order of the scans is not known"
+                if positions == 1
+                else "the scans have only two positions in the writing order"
+            )
         elif "probe" in effect.needs and study.scans[0].stored.seen_by == "confocal":
             reasons[effect.name] = "a confocal microscope has no probe"
     return reasons

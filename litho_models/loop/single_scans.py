@@ -9,7 +9,7 @@ the residual of the other half.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -52,6 +52,7 @@ class SingleScans:
         self.study, self.scans, self.maps_um, self.steps_um = study, study.scans, maps_um, steps_um
         # Each test needs two sets of residuals, and one of them is needed again by the next test.
         self._freed_um = lru_cache(maxsize=2)(self._without)
+        self._profiled = cache(self._with_profile)
 
     def findings(self) -> list[ScanFinding]:
         """Test all per-scan effects, one after the other, and return the findings about them and about marks.
@@ -76,7 +77,7 @@ class SingleScans:
         """Fit terms to each scan and return the residuals, µm. If ``axis`` is given, the mean profile of the
         scans of other folds is subtracted first; see ``_with_profile``.
         """
-        maps = self.maps_um if axis is None else self._with_profile(axis)
+        maps = self.maps_um if axis is None else self._profiled(axis)
         blocks = Blocks(seed=self.study.seed)
         return [
             cross_fit(scan.stored.height_um, own, scan.usable, terms, blocks, scan_line=scan.line).residual_um

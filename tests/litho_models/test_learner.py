@@ -93,7 +93,7 @@ def test_the_learner_measures_the_size_of_changes_by_layout_order_or_place(rest_
     rest, true = rest_without(change), rest_without(None)
     there = float((rest.squares_nm2 - true.squares_nm2).mean())
     assert rest.matters
-    assert rest.ci95_nm2[0] <= rest.mean_nm2 <= rest.ci95_nm2[1]
+    assert rest.limits_nm2[0] <= rest.mean_nm2 <= rest.limits_nm2[1]
     # Allow a fifth for the scatter of 200 coefficients from 64,000 pixels and for the ridge.
     assert 0.8 * there < rest.mean_nm2 < 1.05 * there
 
@@ -163,8 +163,7 @@ def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scen
 def test_the_error_of_the_form_is_the_upper_end_of_what_could_be_learned() -> None:
     gains = np.array([8.0, 10.0, 9.0, 11.0, 10.0, 12.0])
     some = Rest(gains, np.full(6, 100.0))
-    assert some.ci95_nm2 is not None
-    assert math.sqrt(10.0) < some.most_nm == pytest.approx(math.sqrt(some.ci95_nm2[1]))
+    assert math.sqrt(10.0) < some.most_nm == pytest.approx(math.sqrt(some.limits_nm2[1]))
     assert Rest(-gains, np.full(6, 100.0)).most_nm == 0.0
     # With too few scans for a confidence interval, the mean is used.
     assert Rest(gains[:2], np.full(2, 100.0)).most_nm == pytest.approx(3.0)

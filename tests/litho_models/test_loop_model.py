@@ -232,6 +232,15 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
     assert state.mse_nm2 > 16
 
 
+def test_an_effect_that_is_added_again_is_replaced() -> None:
+    name = "slope-thinning"
+    usual = get_effect(name).with_values({})
+    split = Twin.bare(base_model()).with_effect(name, "print", {"1": usual, "2": usual})
+    again = split.with_effect(name, ALL, {"": {**usual, "along_x_um": 0.2}})
+    assert {slot.label for slot in again.effects} == {""}
+    assert again.values()[name]["along_x_um"] == 0.2
+
+
 def test_scans_of_the_same_position_in_the_order_stay_together() -> None:
     orders = (0, 4, 4, 9)
     scans = [replace(s, order=order) for s, order in zip(blank_scans(4, 32), orders, strict=True)]

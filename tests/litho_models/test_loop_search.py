@@ -284,6 +284,11 @@ def test_what_scans_cannot_test_is_said_before_any_fit() -> None:
     needing = {name for name, one in CATALOGUE.items() if "order" in one.needs and not one.per_scan}
     assert set(untestable(study_of(unordered))) == needing
     assert needing
+    # An effect of the order cannot be told from a difference between two groups of scans.
+    halves = [replace(scan, order=number // 5) for number, scan in enumerate(scans)]
+    reasons = untestable(study_of(halves))
+    assert set(reasons) == needing
+    assert set(reasons.values()) == {"the scans have only two positions in the writing order"}
     by_light = [replace(scan, seen_by="confocal") for scan in scans]
     assert set(untestable(study_of(by_light))) == {"tip-dilation", "feedback-lag"}
     for tested in (scans, [flat[0], *scans[1:]]):

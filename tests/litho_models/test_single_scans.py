@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from litho_data.register.bend import Bend
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import ScanFinding
@@ -181,3 +182,18 @@ def test_the_lines_to_which_a_scan_is_compared_are_of_other_folds(axis: int) -> 
     ]
     for fold, before, after in zip(study.fold_of, *both, strict=True):
         assert np.array_equal(before, after) == (fold == 0)
+
+
+def test_marks_are_listed_beside_the_terms() -> None:
+    study = study_of(planted(size_px=SMALL_PX))
+    maps = truths(study.scans)
+    bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (SMALL_PX, SMALL_PX), (0.1, 0.1))
+    bent = [replace(one, stored=replace(one.stored, bend_um=bend)) for one in study.scans]
+    plain, rounded = (
+        {one.name: one for one in SingleScans(replace(study, scans=bent), maps, steps).findings()}
+        for steps in ([], [0.01] * len(bent))
+    )
+    assert rounded.keys() - plain.keys() == {"quantisation"}
+    assert "10 nm" in rounded["quantisation"].evidence
+    assert "scars-and-spikes" in plain
+    assert f"straightened {len(bent)} of {len(bent)} scans" in plain["registration-residual"].evidence
