@@ -4,6 +4,8 @@ the faults of ``tests/faults.py`` can still be put into the code.
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from tests.faults import FAULTS, ROOT
@@ -39,3 +41,10 @@ def test_a_mistake_is_answered_in_one_line(did, mistake, files):
 def test_the_right_text_of_every_fault_stands_once_in_its_file():
     found = {fault.name: (ROOT / fault.file).read_text("utf-8").count(fault.right) for fault in FAULTS}
     assert {name: count for name, count in found.items() if count != 1} == {}
+
+
+def test_the_tests_of_every_fault_exist():
+    for fault in FAULTS:
+        file, *selected = fault.tests.split()
+        names = re.findall(r"def test_(\w+)", (ROOT / file).read_text("utf-8"))
+        assert [name for name in names if "-k" not in selected or selected[-1] in name], fault.name
