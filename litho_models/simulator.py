@@ -178,8 +178,8 @@ class Simulator(nn.Module, ABC):
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """Return the values of those parameters that are single numbers, keyed by name. A parameter with a
-        range is converted from its raw number to the physical value, and its key is the name of the range.
+        """Return the values of all scalar parameters, keyed by name. If a parameter has a range, its raw
+        number is converted to the physical value, and its key is the name of the range.
         """
         ranges, found = self.ranges, dict[str, Tensor]()
         for key, raw in self.named_parameters():

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 import typer.core
+from typer.models import CommandFunctionType
 
 from litho_data.commands.progress import command_line, given_words, never_silent
 from litho_data.foundation import InputError, unknown_name
@@ -39,13 +40,7 @@ COMPUTING = "Where it runs"
 _CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
 _LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
 WorkersOption = Annotated[
-    int,
-    option(
-        "number of local processes",
-        "--workers",
-        min=1,
-        rich_help_panel=COMPUTING,
-    ),
+    int, option("number of local processes", "--workers", min=1, rich_help_panel=COMPUTING)
 ]
 DaskOption = Annotated[
     str | None,
@@ -143,10 +138,12 @@ class _Command(typer.core.TyperCommand):
                     formatter.write_dl(records)
 
 
-class _App(typer.Typer):
-    """An application whose commands are of the class ``_Command``."""
+class App(typer.Typer):
+    """A program, or a group of commands of a program. The help of each command lists the options under
+    headings.
+    """
 
-    def command(self, *names: Any, **more: Any) -> Any:
+    def command(self, *names: Any, **more: Any) -> Callable[[CommandFunctionType], CommandFunctionType]:
         """Return typer's decorator that makes a function a command."""
         return super().command(*names, cls=_Command, **more)
 
@@ -177,7 +174,7 @@ def new_app(help_text: str) -> typer.Typer:
             raise typer.Exit(2)
 
     # Without invoke_without_command, --version alone would fail because no command is given.
-    return _App(
+    return App(
         help=help_text,
         callback=options,
         invoke_without_command=True,

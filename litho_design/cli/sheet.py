@@ -9,11 +9,12 @@ from typing import Annotated
 
 import typer
 
+from litho_data.commands.app import App
 from litho_design.cli.design import Target
 from litho_design.cli.options import Device, Out
 from litho_design.exports.job import Format
 
-sheet = typer.Typer(help="Make one sheet of prints for a lab, and evaluate its scans.", no_args_is_help=True)
+sheet = App(help="Make one sheet of prints for a lab, and evaluate its scans.", no_args_is_help=True)
 
 
 @sheet.command("new")

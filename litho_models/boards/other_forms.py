@@ -187,7 +187,7 @@ def _fast_axis_memory(rng: Rng) -> Law:
 
 @_form("crowding", "dose", "1", 4.0)
 def _crowding(rng: Rng) -> Law:
-    """Relative increase of the dose, per cube of the mean dose within 2.5–5 µm."""
+    """Relative increase of the dose, divided by the cube of the mean dose within 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
         dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)

@@ -8,6 +8,7 @@ import typer
 
 import litho_models
 from litho_data.commands.app import (
+    App,
     DaskOption,
     WorkersOption,
     argument,
@@ -29,7 +30,7 @@ app.command("close-loop")(close_loop)
 app.command("next-print")(next_print)
 app.command()(noise)
 app.command()(check)
-zoo = typer.Typer(help="List or show the models that come with the package.", no_args_is_help=True)
+zoo = App(help="List or show the models that come with the package.", no_args_is_help=True)
 app.add_typer(zoo, name="zoo")
 app.add_typer(board, name="board")
 

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from litho_data.commands.app import argument, option
+from litho_data.commands.app import App, argument, option
 from litho_data.commands.progress import say
 
-board = typer.Typer(
+board = App(
     help="Blind boards: simulated stores that show whether a loop can name hidden causes.",
     no_args_is_help=True,
 )

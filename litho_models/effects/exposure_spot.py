@@ -94,7 +94,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
     spot is lost, and a gap that is narrower than the spot is filled.
     """
-    # A logistic function is a hyperbolic tangent of half the steepness.
+    # ``project`` uses a hyperbolic tangent. With half the steepness, it has the shape of a logistic function.
     exposed = context.exposed_slices
     gained = project(exposed, values["steepness"] / 2, values["threshold"]) - exposed
     return height + values["share"] * context.slice_um * gained.sum(dim=0, keepdim=True)

@@ -68,7 +68,8 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int, r
     measurement = learn_measurement(stored, maps, seed=seed)
     if refit and len(twin.vector):
         freed = map(measurement.freed, stored, maps)
-        # The scans are numbered anew, so that their windows again cover all quadrants of the field evenly.
+        # The number of a scan determines which quadrant its window covers. With consecutive numbers, the
+        # windows are distributed evenly over the quadrants.
         numbered = enumerate(zip(scans, freed, strict=True))
         windows = [replace(scan, stored=own, number=at).window for at, (scan, own) in numbered]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)

@@ -162,8 +162,11 @@ class PreparedScan:
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
     def freed(self, values: np.ndarray, prediction_um: np.ndarray) -> np.ndarray:
-        """Project all free terms out of values at the n sampled pixels. The terms are computed from a
-        predicted height, µm, of shape (ny, nx). The values and the result have shape (n,) or (n, m).
+        """Subtract from values at the n sampled pixels the part that the free terms can explain.
+
+        Args:
+            values: one or m columns of values, of shape (n,) or (n, m). The result has the same shape.
+            prediction_um: predicted height from which the terms are computed, µm, of shape (ny, nx).
         """
         basis = self.free_basis(prediction_um, ALL_FREE)
         return values - basis @ (basis.T @ values)

@@ -266,6 +266,7 @@ class CloseLoop(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
     FILE_NAME: ClassVar[str] = "close_loop.json"
+
     run: RunInfo
     dataset: DatasetId
     base_model: str

@@ -97,8 +97,8 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the fitted values of the parameters of the base model that are single numbers, keyed by name.
-    The result is empty if the base model was not fitted.
+    """Return the fitted values of the scalar parameters of the base model, keyed by name. The result is empty
+    if the base model was not fitted.
     """
     base = twin.fitted_base
     known = base.values if twin.own and isinstance(base, Simulator) else {}

@@ -46,9 +46,11 @@ class Trial:
     parameters and differ only in which amplitudes are switched on. A regression fits one factor per set,
     which multiplies the change that the set makes.
 
-    Each set gives one column of the regression. ``columns`` contains the numbers of these columns. If there
-    are no sets, the columns are the derivatives of the prediction with respect to the amplitudes of an effect
-    in the model, and the factors are not limited.
+    There is one column of the regression for each set. ``columns`` contains the numbers of the columns.
+
+    A trial without sets stands for an effect that the model already contains. There is then one column for
+    each amplitude: the derivative of the prediction with respect to this amplitude. The factor of a column is
+    the change of the amplitude, and it is not limited.
     """
 
     effect: Effect

@@ -171,11 +171,13 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secan
 
 
 def _regroup(found: Found, number: int) -> None:
-    """Let the strength of a cause differ by group if held-out scans confirm that it does. ``number`` is the
-    index of the cause in ``found.causes``.
+    """Let the strength of a cause differ by group if held-out scans confirm that it does.
 
     Screening has already tried strengths that differ by group. This second test is more reliable, because it
     uses the derivative of the prediction at the fitted strength of the cause.
+
+    Args:
+        number: index of the cause in ``found.causes``.
     """
     cause, twin, study = found.causes[number], found.state.twin, found.state.study
     if cause.by != ALL:

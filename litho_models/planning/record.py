@@ -87,6 +87,7 @@ class NextPrint(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
     FILE_NAME: ClassVar[str] = "plan.json"
+
     run: RunInfo
     dataset: DatasetId
     settings: dict[str, Any]
