@@ -21,7 +21,8 @@ from litho_models.effects import get_effect
 from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.card import OUT_OF_FOLD
-from litho_models.frozen.files import MODEL_FILES, save_frozen
+from litho_models.frozen.files import MODEL_FILES, load_frozen, save_frozen
+from litho_models.frozen.on_store import trained_ids
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, errors_of_others, nested_errors
@@ -33,6 +34,7 @@ from litho_models.loop.record import CloseLoop, Decision, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.single_scans import SingleScans
+from litho_models.models import MODELS
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split
 
@@ -95,8 +97,8 @@ def close_loop(
 
     Raises:
         InputError: there is no store, the base is unknown, the usable scans show fewer than two printed
-            fields, or ``nested`` is set although the loop does not refit the base or although there is only
-            one print.
+            fields, the base is a frozen network that was trained on scans of this store, or ``nested`` is set
+            although the loop does not refit the base or although there is only one print.
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
@@ -121,9 +123,17 @@ def close_loop(
         study = replace(study, workers=places)
         kept = Path(cache or f"{out}-cache")
         bases = bases_for(base, study, steps=steps, cache=kept, fields=base_settings)
-        if nested and not all(map(is_refitted, bases.values())):
+        refitted = all(map(is_refitted, bases.values()))
+        if nested and not refitted:
             raise InputError(
                 f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
+            )
+        if not refitted and base not in MODELS and trained_ids(load_frozen(base), opened):
+            raise InputError(
+                f"base {base}",
+                got="a model that was trained on scans of this store, so no scan is held out",
+                wanted="a model of other prints",
+                hint="give the name of a model, such as pbl, to train it without each fold",
             )
         closed = close(study, bases)
 

@@ -54,7 +54,7 @@ def make_scans(count: int, size_px: int = 96, **settings: float) -> list[Printed
     return [make_scan(number, size_px, **settings) for number in range(count)]
 
 
-def write_store(path: Path, scans: Sequence[PrintedScan], **attributes: float) -> Path:
+def write_store(path: Path, scans: Sequence[PrintedScan], **attributes: float | str) -> Path:
     """Write a store in the published format, using only xarray."""
     import xarray as xr
 

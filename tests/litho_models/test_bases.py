@@ -21,7 +21,9 @@ from litho_data.store.printed_scan import scan_sha256
 from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.fitting import Fitted
+from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
+from litho_models.frozen.freezing import freeze
 from litho_models.loop.bases import bases_for, train_folds
 from litho_models.loop.closing import close
 from litho_models.loop.errors import HeldOut
@@ -177,6 +179,20 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
     store = write_store(tmp_path / "s.zarr", scans)
     with pytest.raises(InputError, match="--nested with zoo:pbl"):
         close_loop(store, tmp_path / "out", base="zoo:pbl", nested="prints")
+
+
+def test_a_frozen_network_is_no_base_for_the_scans_it_was_trained_on(tmp_path: Path) -> None:
+    """Check that no error is called held out although the base has seen the scan."""
+    scans = make_scans(6, size_px=56)
+    store = write_store(tmp_path / "s.zarr", scans)
+    moved = with_heights(scans, [one.height_um + 0.001 for one in scans])
+    other = write_store(tmp_path / "other.zarr", moved, name="other prints")
+    train(store, "features", tmp_path / "run")
+    freeze(tmp_path / "run", tmp_path / "model")
+    with pytest.raises(InputError, match="trained on scans of this store"):
+        close_loop(store, tmp_path / "out", base=str(tmp_path / "model"))
+    assert not (tmp_path / "out").exists()
+    close_loop(other, tmp_path / "out", base=str(tmp_path / "model"))
 
 
 def test_prints_are_left_out_only_if_there_are_two(tmp_path: Path) -> None:
