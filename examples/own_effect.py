@@ -50,7 +50,6 @@ def register() -> None:
             acts_on="height",
             parameters={"depth_um": Parameter("µm", 0.0, 0.3, 0.03)},
             apply=sinking_layers,
-            source="an example",
             separating="print staircases with and without the promoter",
         )
     )
@@ -63,7 +62,6 @@ def register() -> None:
             acts_on="height",
             parameters={"bow_xxx_um": Parameter("µm", -0.3, 0.3, 0.02)},
             apply=of_single_scans,
-            source="an example",
             separating="scan a flat substrate",
         )
     )

@@ -43,8 +43,6 @@ _ORDERS = (3, 4, 5, 6)
 # factor ``_LARGER``. In addition, all terms of tilt and bow may have one common relative error, whose
 # standard deviation is ``_COMMON_SD``. Both numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
-# Order of the polynomial of the expected height that is fitted together with tilt and bow.
-_HEIGHT_POWERS = 3
 # Number of groups into which the pixels are divided by their expected height.
 _HEIGHTS = 32
 
@@ -303,17 +301,13 @@ class Background:
 def fitted_background(
     height_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray, pitch_um: float, levelling: Levelling
 ) -> Background:
-    """Fit the tilt and bow of a scan by least squares, together with a polynomial of the expected height. All
+    """Fit the tilt and bow of a scan, together with the gain of the expected print, by least squares. All
     maps have shape (ny, nx).
-
-    The polynomial is there because a printer may print high levels lower than expected. If a layout has more
-    of these levels in its middle, such a print is bent, and without the polynomial this would be removed.
     """
     ny, nx = height_um.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
-    powers = [expected_um**power for power in range(_HEIGHT_POWERS + 1)]
-    columns = np.stack([*terms, *powers], axis=-1)
+    columns = np.stack([*terms, expected_um, np.ones_like(x)], axis=-1)
     found, *_ = np.linalg.lstsq(columns[valid], height_um[valid].astype(float), rcond=None)
     slopes = found[:2] if terms else np.zeros(2)
     bow = columns[..., 2 : len(terms)] @ found[2 : len(terms)]

@@ -207,7 +207,6 @@ class Effect:
         trials: parameter sets that screening tries. By default, each set switches on only one amplitude, and
             the sets contain all combinations of the ``tried`` values of this amplitude with the ``tried``
             values of the shapes.
-        source: where the formula comes from, such as a publication.
         separating: experiment that distinguishes this effect from similar effects.
         needs: what must be given before the effect can be tested. ``order``: the writing order of the scans
             must be known. ``probe``: the microscope must have a probe.
@@ -226,7 +225,6 @@ class Effect:
     acts_on: ActsOn
     parameters: Mapping[str, Parameter]
     apply: Apply
-    source: str
     separating: str = ""
     trials: tuple[Mapping[str, float], ...] = ()
     needs: tuple[Literal["order", "probe"], ...] = ()

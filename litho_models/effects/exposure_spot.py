@@ -26,13 +26,14 @@ _SPOT_REACH_UM = 2.0
         name: Parameter("µm²", -0.4, 0.4, 0.02, tried=(0.02, 0.1, -0.1))
         for name in ("stretch_um2", "shear_um2")
     },
-    source="Gaussian spot of the paper, with a full second-moment matrix",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Make the spot elliptical: multiply the spectrum of the layout by T = exp(-2 π² fᵀ C f). This adds the
     matrix C to the matrix of second moments of the spot. The parameters of the effect are Cxx - Cyy and
     2 Cxy.
+
+    Source: Gaussian spot of the paper, with a full second-moment matrix.
     """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
@@ -50,23 +51,26 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
         "weight": Parameter("1", -0.3, 1.5, 0.1),
         "length_um": Parameter("µm", 0.6, 10.0, 2.0, "shape", tried=(1.0, 2.0, 4.0, 8.0)),
     },
-    source="proximity sum of two Gaussians, as in electron-beam writing; weights may be negative",
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that leaks in from the neighbourhood of each pixel; see ``add_scattered``."""
+    """Add the dose that leaks in from the neighbourhood of each pixel; see ``add_scattered``.
+
+    Source: proximity sum of two Gaussians, as in electron-beam writing; weights may be negative.
+    """
     return add_scattered(layout, values["weight"], values["length_um"], context.pitch_um)
 
 
 @of_exposure(
     "height not proportional to dose",
     {"exponent": Parameter("1", 0.4, 2.0, 1.15, null=1.0)},
-    source="Schwarzschild exponent of the dose",
     separating="a wide staircase of all levels and a power sweep",
 )
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Raise the dose to a power: D = M_ref (M / M_ref)^p, where M_ref is the full height. Before the power is
     taken, 1 % of M_ref is added to M, so that the slope at M = 0 stays finite.
+
+    Source: Schwarzschild exponent of the dose.
     """
     foot = 0.01
     exponent, full = values["exponent"], context.full_height_um
@@ -83,7 +87,6 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
         "steepness": Parameter("1", 4.0, 40.0, 12.0, "shape"),
     },
     acts_on="height",
-    source="slices of 0.1 µm, as in the paper, with a threshold applied to each slice",
     separating="pillars and pits of one width and several heights, from one slice to many",
 )
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -93,6 +96,8 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     The effect adds the second expression minus the first to the height. The function ``step`` is a logistic
     function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
     spot is lost, and a gap that is narrower than the spot is filled.
+
+    Source: slices of 0.1 µm, as in the paper, with a threshold applied to each slice.
     """
     # ``project`` uses a hyperbolic tangent. With half the steepness, it has the shape of a logistic function.
     exposed = context.exposed_slices

@@ -22,12 +22,13 @@ _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 @of_exposure(
     "dose falling towards the edge of the write field",
     {"strength": Parameter("1", 0.0, 0.6, 0.1)},
-    source="aperture of scanning objectives; quadratic in the field radius",
     separating="print one layout at the centre and at the edge of the write field",
 )
 def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Reduce the dose towards the edge of the write field: D = M (1 - v r² / R²), where r is the distance
     from the centre of the write field and R is half the width of the write field.
+
+    Source: aperture of scanning objectives; quadratic in the field radius.
     """
     y, x = context.centred_um()
     return layout * (1 - values["strength"] * (y * y + x * x) / context.radius_um() ** 2)
@@ -37,13 +38,14 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     "focus surface tilted or curved over the write field",
     {name: Parameter("µm", -0.6, 0.6, 0.05) for name in ("tilt_x_um", "tilt_y_um", "curvature_um")},
     acts_on="height",
-    source="Ellingen 2023, JOM 3(4) 043501",
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Add the height changes caused by a focus surface that is tilted or curved over the write field:
     H + 1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
     field.
+
+    Source: Ellingen 2023, JOM 3(4) 043501.
     """
     y, x = context.centred_um()
     radius = context.radius_um()
@@ -56,13 +58,14 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
     "laser power drifting while the set is written",
     {"drift": Parameter("1 over the set", -0.5, 0.5, 0.1)},
     role="nuisance",
-    source="linear in the writing order",
     separating="repeat one layout at the start, the middle and the end of the set; log the laser power",
     needs=("order",),
 )
 def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Let the dose drift from field to field: D = M (1 + ρ t), where ρ is the relative drift over all fields
     and t is the position of the field in the writing order, from -0.5 to 0.5.
+
+    Source: linear in the writing order.
     """
     return layout * (1 + values["drift"] * context.order)
 
@@ -76,7 +79,6 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
         "length_um": Parameter("µm", 0.3, 3.0, 1.5, "shape"),
     },
     acts_on="height",
-    source="the printer searches for the interface before writing; heights are clipped at the substrate",
     separating="leave bare substrate in every field",
 )
 def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -86,6 +88,8 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     The removed part has height z, and it shrinks like the rest of the print: z = z0 (1 - k (1 - u)). Here z0
     is the depth at which writing started, measured from the surface of the substrate, and u is the mean
     nominal height nearby as a fraction of the full height.
+
+    Source: the printer searches for the interface before writing; heights are clipped at the substrate.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - context.dose_nearby(values["length_um"]))
@@ -99,13 +103,14 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
         "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
         "direction": DIRECTION,
     },
-    source="first-order lag of the deflection, l = speed x time constant",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Let the beam lag behind the commanded position: filter the layout along the written lines with a
     one-sided exponential of length l = v τ (speed times time constant). The mean delay l of this filter is
     removed, because registration removes every mean shift.
+
+    Source: first-order lag of the deflection, l = speed x time constant.
     """
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
@@ -120,7 +125,6 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     "written lines that begin and end too late",
     {axis: Parameter("µm", -0.6, 0.6, 0.1) for axis in ("along_x_um", "along_y_um")},
     trials=ALONG_AXES,
-    source="shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm",
     separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
 )
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -128,6 +132,8 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
 
     At an edge, the formula removes the correct area, but gives the edge a wrong profile. This error does not
     matter, because the spot is wider than δ and determines the profile of the edge.
+
+    Source: shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -136,7 +142,6 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
 @of_exposure(
     "uneven motion of the printer's scanner along the written lines",
     {"strength": Parameter("1", -0.05, 0.05, 0.005)},
-    source="distortion of the write field by a galvo or a stage, quadratic along the line",
     separating="scan each print at 0 and 90 degrees; scan a calibration grating",
 )
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -145,6 +150,8 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
 
     If x is measured from the edge of the write field instead, the full displacement is c x (1 - x / 2R). The
     formula above leaves out the part of this displacement that registration removes.
+
+    Source: distortion of the write field by a galvo or a stage, quadratic along the line.
     """
     fast = 1 if context.slow_axis == "y" else 0
     half_um = context.whole_shape()[fast] * context.pitch_um / 2
@@ -162,12 +169,13 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
         "direction": DIRECTION,
     },
     stage="resist",
-    source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
     separating="print the same layout with the writing order reversed",
 )
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0). Here e is the strength of the
     depletion, and the kernel K_l is a one-sided exponential of length l along the slow axis.
+
+    Source: oxygen and radical depletion along the slow writing axis, y unless the card says x.
     """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
     pitch = context.pitch_um
@@ -191,7 +199,6 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     },
     role="nuisance",
     acts_on="height",
-    source="ripples in the noise figure of the paper, at a pitch of 0.1 µm",
     separating="rescan at 25 nm per pixel",
 )
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -200,6 +207,8 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
     The frequency f is the alias frequency |1/p - 1/dx|, where dx is the pixel size. The ripples have a fixed
     phase in the write field, so they are the same in every print.
+
+    Source: ripples in the noise figure of the paper, at a pitch of 0.1 µm.
     """
     across_um = context.centred_um()["yx".index(context.slow_axis)]
     phase = 2 * math.pi * values["frequency_per_um"] * across_um

@@ -43,11 +43,13 @@ _of_films = partial(entry, role="process", of_films=True)
     },
     stage="exposure",
     acts_on="layout",
-    source="second Gaussian of the proximity function: Chang, J. Vac. Sci. Technol. 12, 1271 (1975)",
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that the substrate scatters back into the film; see ``add_scattered``."""
+    """Add the dose that the substrate scatters back into the film; see ``add_scattered``.
+
+    Source: second Gaussian of the proximity function: Chang, J. Vac. Sci. Technol. 12, 1271 (1975).
+    """
     return add_scattered(layout, values["weight"], values["length_px"], 1.0)
 
 
@@ -56,12 +58,13 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     {"variance_px2": Parameter("px²", 0.0, 150.0, 8.0, tried=(8.0, 45.0))},
     stage="resist",
     acts_on="height",
-    source="acid or reactants diffuse in a resist of high contrast, which has a threshold at one half",
     separating="write necks and islands of five widths, at two baking times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Blur the film by a Gaussian of variance s², and place the new edge where the blurred film is
     one half.
+
+    Source: acid or reactants diffuse in a resist of high contrast, which has a threshold at one half.
     """
     full = context.full_height_um
 
@@ -80,17 +83,18 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     {"bias_px": Parameter("px", -8.0, 8.0, 1.4, tried=(1.0, -1.0))},
     stage="development",
     acts_on="height",
-    source="lateral etching at a constant rate, the same at every dose and in every surrounding",
     separating="write one layout at five doses; a bias does not depend on the dose",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards by the bias."""
+    """Move edges outwards by the bias.
+
+    Source: lateral etching at a constant rate, the same at every dose and in every surrounding.
+    """
     return _moved(height, values["bias_px"], context)
 
 
 _AS_LAW: dict[str, Any] = {
     "role": "undetermined",
-    "source": "found in the residual; M̄ is the Gaussian-weighted mean of the film M (0 to 1) over a length",
     "separating": "write straight edges beside bare ground and beside films of three widths, at five doses",
     "knowledge": "law",
 }

@@ -6,6 +6,10 @@ a length, a direction or a position. A law does not state the cause of the depar
 fits, judges and applies laws and all other effects. A table is an effect with many strengths. A table can
 describe any dependence on one covariate, such as the level or the position, but does not explain this
 dependence.
+
+In formulas, h is the height and D the dose, both in µm. h̄ is the Gaussian mean of h over a length. x and y
+run from -1 to 1 over the scan, r² = x² + y², and rim = e^(-distance to the edge / length). The order t runs
+from -0.5 to 0.5. Slopes and sides are along axes rotated by the angle ``turn_deg``.
 """
 
 from __future__ import annotations
@@ -168,9 +172,6 @@ def _nameless(
         acts_on=on,
         parameters=parameters,
         apply=apply,
-        source="found in the residual. h and the dose D are in µm; h̄ is the Gaussian mean of h over a "
-        "length. x and y run from -1 to 1 over the scan; r² = x² + y², and rim = e^(-distance to the edge / "
-        "length). The order t runs from -0.5 to 0.5. Slopes and sides are along axes rotated by turn_deg",
         separating=_TURNED,
         knowledge="law",
     )
@@ -276,7 +277,6 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
         title,
         {name: Parameter(unit, -1.0, 1.0, 0.02) for name in names},
         role="undetermined",
-        source="a table along a covariate",
         separating=_TURNED,
         knowledge="description",
     )

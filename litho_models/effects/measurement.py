@@ -28,7 +28,6 @@ _BLUR_REACH_UM = 4.0
         "rising": Parameter("1", 0.0, 1.0, 0.5, "shape", tried=(1.0, 0.4)),
         "direction": DIRECTION,
     },
-    source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
     separating="compare trace and retrace; scan at 0 and 90 degrees",
     reverses=("direction",),
     needs=("probe",),
@@ -41,6 +40,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     the probe. If ``rising`` is 1, the probe acts as a linear filter. If ``rising`` is below 1, the probe
     follows falling edges more slowly than rising edges, because it loses contact there (parachuting). The
     time constant of the lag is fixed, so l is shorter if the pixels are smaller.
+
+    Source: first-order feedback loop; a probe that parachutes loses the surface on the way down.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -59,7 +60,6 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
 @of_microscope(
     "uneven motion of the microscope's scanner along a line",
     {"strength": Parameter("1", -0.05, 0.05, 0.005)},
-    source="hysteresis of a piezo scanner, quadratic along the line",
     separating="scan a calibration grating; scan at 0 and 180 degrees",
     reverses=("strength",),
 )
@@ -69,6 +69,8 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 
     The full displacement is c x (1 - x / L), where x is measured from the start of the line. The formula
     leaves out the part of this displacement that registration removes.
+
+    Source: hysteresis of a piezo scanner, quadratic along the line.
     """
     _, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
@@ -78,13 +80,14 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 @of_microscope(
     "blur of the finished scan",
     {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025, tried=(0.0025, 0.04))},
-    source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes have slower filters",
     separating="register with two interpolation kernels; scan with half the pixel size",
 )
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Blur the finished scan with a Gaussian, as interpolation or the microscope's low-pass filter does.
 
     The width of the blur is a fixed number of pixels, so smaller pixels give less blur.
+
+    Source: kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes have slower filters.
     """
     variance_um2 = values["variance_um2"] * context.pixel_size**2
     return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
@@ -103,7 +106,6 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
         {"radius_um": 0.4, "across": _SHARPER},
         {"radius_um": 0.4, "along": _SHARPER},
     ),
-    source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
     separating="scan again with a new tip, or with the print rotated if the tip is asymmetric; "
     "scan a tip characteriser",
     of_tip=True,
@@ -115,6 +117,8 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
     A tip may be sharper along or across the scan lines. Its radii in these directions are ``along`` × R and
     ``across`` × R.
+
+    Source: dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis.
     """
     radius = values["radius_um"]
     # The formula divides by the radius. For tips sharper than ``_SHARPEST_UM``, the formula is therefore

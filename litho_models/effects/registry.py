@@ -20,6 +20,7 @@ _of_microscope = partial(
 _STEP = "scan a step standard and a bare substrate before and after the print"
 
 EFFECTS = (
+    # Source: arXiv:2309.17343: line-like noise along the hatching, too random for any model to predict.
     Effect(
         "line-roughness",
         "height of each written line",
@@ -28,9 +29,9 @@ EFFECTS = (
         acts_on="height",
         parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
         apply=of_single_scans,
-        source="arXiv:2309.17343: line-like noise along the hatching, too random for any model to predict",
         separating="scan the same field at 0 and 90 degrees",
     ),
+    # Error of the lateral map from scan to layout, affine and quadratic.
     _of_microscope(
         "registration-residual",
         "shift and distortion left by the registration",
@@ -41,23 +42,23 @@ EFFECTS = (
                 *(f"{axis}_by_{power}_um" for axis in ("y", "x") for power in ("yy", "xy", "xx")),
             )
         },
-        source="error of the lateral map from scan to layout, affine and quadratic",
         separating="alignment marks in every field",
     ),
+    # Calibration of the z-scanner.
     _of_microscope(
         "z-gain",
         "height calibration of each scan",
         parameters={"gain": Parameter("1", -0.2, 0.2, 0.02)},
-        source="calibration of the z-scanner",
         separating=_STEP,
     ),
+    # Levelling without a reference surface.
     _of_microscope(
         "datum-offset",
         "zero height of each scan",
         parameters={"offset_um": Parameter("µm", -0.5, 0.5, 0.03)},
-        source="levelling without a reference surface",
         separating="leave bare substrate in every field",
     ),
+    # Sample tilt, scanner bow, and errors of polynomial levelling.
     _of_microscope(
         "tilt-bow",
         "tilt and bow of each scan",
@@ -65,21 +66,20 @@ EFFECTS = (
             name: Parameter("µm", -0.5, 0.5, 0.02)
             for name in ("tilt_x_um", "tilt_y_um", "bow_xx_um", "bow_xy_um", "bow_yy_um")
         },
-        source="sample tilt, scanner bow, and errors of polynomial levelling",
         separating=_STEP,
     ),
+    # Drift and feedback noise between the lines of a raster scan.
     _of_microscope(
         "scan-line-stripes",
         "height offset of every scan line",
         parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
-        source="drift and feedback noise between the lines of a raster scan",
         separating="scan the same field at 0 and 90 degrees",
     ),
+    # Exponential creep of the scanner; the bow contains the slow part of the creep.
     _of_microscope(
         "slow-drift",
         "creep after the scan starts",
         parameters={name: Parameter("µm", -1.0, 1.0, 0.03) for name in CREEP_DECAYS},
-        source="exponential creep of the scanner; the bow contains the slow part of the creep",
         separating="scan the same field twice in a row, downwards and upwards",
     ),
 )

@@ -23,12 +23,13 @@ _OF_NARROW = {
 @of_resist(
     "reactants diffusing sideways",
     {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.01, tried=(0.01, 0.09))},
-    source="Lang 2022, arXiv:2205.14891; the paper's diffusion kernel",
     separating="step edges of two heights, scanned with two pixel sizes and a new tip",
 )
 def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Blur H by an isotropic Gaussian of variance s², which describes reactants that diffuse after the
     exposure.
+
+    Source: Lang 2022, arXiv:2205.14891; the paper's diffusion kernel.
     """
     return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
 
@@ -39,7 +40,6 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
         "steepness_squared": Parameter("1", 0.0, 60.0, 2.0),
         "centre": Parameter("1", 0.05, 0.95, 0.5, "shape", tried=(0.2, 0.5, 0.8)),
     },
-    source="Zhou 2014, the normalised projection used in the paper's Physics model",
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -48,6 +48,8 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
 
     With x = H / full height, the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
     expression equals the usual quotient of sums of tanh, and it is even and analytic in α.
+
+    Source: Zhou 2014, the normalised projection used in the paper's Physics model.
     """
     full, centre = context.full_height_um, values["centre"]
     relative = height / full
@@ -64,12 +66,13 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
 @of_resist(
     "tall structures growing less than nominal",
     {"rate_per_um": Parameter("1/µm", 0.0, 1.0, 0.1)},
-    source="first-order saturation of the printed height",
     separating="a wide staircase of all levels",
 )
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Reduce the height of tall structures, whose height is less than proportional to the dose: H / (1 + q
     |H|).
+
+    Source: first-order saturation of the printed height.
     """
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
@@ -77,11 +80,13 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
 @of_development(
     "the whole print losing height in development",
     {"fraction": Parameter("1", 0.0, 0.7, 0.05)},
-    source="Meisel 2006, cited in the paper",
     separating="a step standard for the microscope, then a printed staircase",
 )
 def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Reduce the height of the whole print by a fraction k: (1 - k) H."""
+    """Reduce the height of the whole print by a fraction k: (1 - k) H.
+
+    Source: Meisel 2006, cited in the paper.
+    """
     return (1 - values["fraction"]) * height
 
 
@@ -91,12 +96,13 @@ def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) ->
         "fraction": Parameter("1", 0.0, 0.5, 0.1),
         "length_um": Parameter("µm", 0.3, 6.0, 1.0, "shape", tried=(0.5, 1.5, 4.0)),
     },
-    source="Lang 2022, arXiv:2205.14891: shrinkage falls with dose",
     separating="print the same height inside low and high surroundings; a power sweep",
 )
 def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shrink the print more where its surroundings are thin: H (1 - k (1 - u)), where u is the mean nominal
     height nearby as a fraction of the full height.
+
+    Source: Lang 2022, arXiv:2205.14891: shrinkage falls with dose.
     """
     return height * (1 - values["fraction"] * (1 - context.dose_nearby(values["length_um"])))
 
@@ -104,7 +110,6 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 @of_development(
     "tops shrinking towards the centre of the field",
     {"fraction": Parameter("1", 0.0, 0.1, 0.005)},
-    source="the print is bound to the substrate at its base but free at its top",
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -115,6 +120,8 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     The shrinkage at the mean height is a change of magnification, which registration removes. In a scan, the
     point r = x / (1 + s H_mean / H_full) of the print therefore appears at position x, where H_mean is the
     mean height.
+
+    Source: the print is bound to the substrate at its base but free at its top.
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -130,12 +137,13 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
 @of_development(
     "narrow tall features losing height",
     _OF_NARROW,
-    source="capillary force while drying; opening of the surface by a square of width w",
     separating="pillars of one height and five widths, dried in air and supercritically",
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Lower features narrower than w by a fraction φ of their height above the surroundings:
     H - φ (H - open_w(H)), where open_w is the morphological opening by a square of side w.
+
+    Source: capillary force while drying; opening of the surface by a square of width w.
     """
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
@@ -143,12 +151,13 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
 @of_development(
     "resist left in narrow trenches",
     _OF_NARROW,
-    source="closing of the surface by a square of width w",
     separating="trenches of five widths, at two development times",
 )
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H), where close_w is the
     morphological closing by a square of side w. The tops are unchanged.
+
+    Source: closing of the surface by a square of width w.
     """
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
 
@@ -204,7 +213,6 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
         for turn in (0.0, 45.0)
         for axes in ALONG_AXES
     ),
-    source="empirical: the loss is a power of the slope, with an ellipse of coefficients in rotated axes",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -213,6 +221,8 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
 
     If cx = cy = c, the loss is c |grad H|^p, regardless of the direction of the slope. If in addition p = 1,
     each edge moves inwards by about c.
+
+    Source: empirical: the loss is a power of the slope, with an ellipse of coefficients in rotated axes.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)

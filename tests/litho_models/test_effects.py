@@ -128,7 +128,6 @@ def test_gradient_to_the_field_is_finite_when_off_and_on(effect: Effect) -> None
 
 @PER_EFFECT
 def test_parameters_have_units_and_bounds_that_hold_their_values(effect: Effect) -> None:
-    assert effect.source
     for parameter in effect.parameters.values():
         assert parameter.unit
         assert parameter.lower < parameter.upper

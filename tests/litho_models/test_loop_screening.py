@@ -121,7 +121,6 @@ def _effect():
             {"a": 0.4, "length_um": 0.5},
             {"a": 0.1},
         ),
-        source="",
     )
 
 
