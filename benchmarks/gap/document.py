@@ -12,7 +12,7 @@ import pandas as pd
 from benchmarks.gap.figures import draw_images, draw_lens
 from benchmarks.gap.plan import ARMS, Plan
 from benchmarks.gap.tables import as_markdown, figure_file
-from benchmarks.gap.tasks import Task
+from benchmarks.gap.tasks import REDUCED, Task
 from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.tasks.design import Design
@@ -57,6 +57,8 @@ def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
     }
     write_record(folder / RESULT_FILE, record)
     for task in tasks:
+        if task.name.endswith(REDUCED):
+            continue
         judge = next(iter(task.judges.items()), None)
         draw = draw_images if task.kind == "hoe" else draw_lens
         draw(out / task.name, gaps[task.name], judge, folder / figure_file(task.name))
@@ -106,6 +108,9 @@ def _search_minutes(folder: Path, gap: GapResult) -> dict[str, float]:
 
 
 def _frame(name: str, gap: GapResult) -> pd.DataFrame:
+    """Return the mean scores by every judge. If some judges are no arms, only their scores are returned."""
+    every = {item.judge for item in gap.summary}
+    judges = every - {*gap.arms} or every
     rows = [
         {
             "task": name,
@@ -119,6 +124,6 @@ def _frame(name: str, gap: GapResult) -> pd.DataFrame:
             "high": None if item.judged_ci95 is None else item.judged_ci95[1],
         }
         for item in gap.summary
-        if item.figure in registered_task(gap.task).headline
+        if item.figure in registered_task(gap.task).headline and item.judge in judges
     ]
     return pd.DataFrame(rows)

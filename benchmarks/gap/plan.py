@@ -40,6 +40,9 @@ class Effort(Record):
     # The precision of the networks during the search. Prints, judges and scores always use float32.
     search_precision: str = "float32"
     seeds: int = 3
+    # The tasks are repeated with smaller elements and more seeds, which gives narrower intervals.
+    reduced_to: float = 0.25
+    reduced_seeds: int = 10
     zoo_seeds: int = 1
     scans: int = 24
     scan_px: int = 512
@@ -47,15 +50,16 @@ class Effort(Record):
     window_px: int = 158
     object_px: int = 96
 
-    @property
-    def hoe_distance_um(self) -> float:
-        """Return the distance of the image from the hologram in µm. It is 300 µm at full size."""
-        return round(300 * self.hoe_px / _FULL_HOE_PX, 3)
+    def side_px(self, kind: str, scale: float = 1.0) -> int:
+        """Return the side of the elements, in pixels. ``kind`` is ``hoe`` or ``lens``."""
+        return round(scale * (self.hoe_px if kind == "hoe" else self.lens_px))
 
-    @property
-    def lens_distance_um(self) -> float:
-        """Return the focal length of the lenses in µm. It is 400 µm at full size."""
-        return round(400 * self.lens_px / _FULL_LENS_PX, 3)
+    def distance_um(self, kind: str, scale: float = 1.0) -> float:
+        """Return the distance of the image from the element in µm. It is proportional to the size of the
+        element. At full size, it is 300 µm for holograms and 400 µm for lenses.
+        """
+        full_um, full_px = (300, _FULL_HOE_PX) if kind == "hoe" else (400, _FULL_LENS_PX)
+        return round(full_um * self.side_px(kind, scale) / full_px, 3)
 
     @classmethod
     def small(cls, size_px: int) -> Effort:
@@ -66,6 +70,8 @@ class Effort(Record):
             hoe_iterations=6,
             lens_iterations=6,
             seeds=2,
+            reduced_to=1.0,
+            reduced_seeds=2,
             scans=4,
             scan_px=128,
             training_steps=4,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from benchmarks.gap.tasks import REDUCED
+
 # The scores that the table of each task shows, with +1 if a higher score is better and -1 if a lower one is.
 SHOWN = {
     "hoe": {"si_psnr_db": +1, "ssim": +1, "eff_signal": +1},
@@ -47,7 +49,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "interval (Student's t) over seeds.\n\n" + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
-        parts.append(_task_part(name, task, [row for row in record["summary"] if row["task"] == name]))
+        if not name.endswith(REDUCED):
+            parts.append(_task_part(name, task, _rows(record, name), _best_arm(record, name)))
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
@@ -63,8 +66,38 @@ def _precision_text(search: str) -> str:
     return f"The searches were computed in {search}, the prints and the scores in float32."
 
 
-def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    kind = next(kind for kind in ("lens-computational", "lens-direct", "hoe") if name.startswith(kind))
+def _rows(record: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    return [row for row in record["summary"] if row["task"] == name]
+
+
+def _kind(name: str) -> str:
+    return next(kind for kind in ("lens-computational", "lens-direct", "hoe") if name.startswith(kind))
+
+
+def _best_arm(record: Mapping[str, Any], name: str) -> str:
+    """Return a text that names the best arm of a task, from the same task at reduced size, if there is one.
+    The reduced task has more seeds.
+
+    The text is empty if there is only one seed, or if the judges are arms themselves. Then, each judge
+    prefers the designs made with it.
+    """
+    reduced = f"{name}{REDUCED}" if f"{name}{REDUCED}" in record["tasks"] else name
+    task, rows = record["tasks"][reduced], _rows(record, reduced)
+    arms = dict.fromkeys(row["arm"] for row in rows)
+    judge = next((row["judge"] for row in rows if row["judge"] not in arms), None)
+    if judge is None or len(task["seeds"]) < 2:
+        return ""
+    figure, sign = next(iter(SHOWN[_kind(name)].items()))
+    means = {row["arm"]: row["judged"] for row in rows if (row["judge"], row["figure"]) == (judge, figure)}
+    told = lead_text(task["paired"], means, figure, sign, judge)
+    if reduced == name:
+        return told
+    scale, count = record["plan"]["effort"]["reduced_to"], len(task["seeds"])
+    return f"The task was repeated with elements of {scale:g} of this size and {count} seeds. {told}"
+
+
+def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], verdict: str) -> str:
+    kind = _kind(name)
     shown = SHOWN[kind]
     values = {(row["arm"], row["judge"], row["figure"]): row for row in rows}
     arms = list(dict.fromkeys(row["arm"] for row in rows))
@@ -103,13 +136,6 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         reached = ", ".join(f"{LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
         head += f" A continuous phase on the same grid, without printer or levels, reaches {reached}."
     head += "\n\n"
-    verdict = ""
-    # If the judges are arms themselves, each judge prefers the designs made with it, so no arm is called the
-    # best.
-    if seeds > 1 and independent:
-        figure, sign = next(iter(shown.items()))
-        means = {arm: values[arm, judges[0], figure]["judged"] for arm in arms}
-        verdict = lead_text(task["paired"], means, figure, sign, judges[0])
     picture = f"![{_FIGURES[kind]}](results/gap/{figure_file(name)})"
     return "\n\n".join(part for part in (head + "\n".join(lines), verdict, picture) if part)
 

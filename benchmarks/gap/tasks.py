@@ -12,6 +12,9 @@ from benchmarks.gap.jobs import Job, design_command
 from benchmarks.gap.plan import ARMS, Effort, model
 from litho_data.foundation.errors import InputError
 
+# The tasks that the fab judges, with the kind of their designs.
+KINDS = {"hoe": "hoe", "lens-direct": "direct", "lens-computational": "computational"}
+REDUCED = "-reduced"
 ZOO_ARMS = ("none", "physics", "fno", "pbl", "random-features")
 
 
@@ -74,8 +77,8 @@ _FEW_DRAWS = ("--yield-draws", 10)
 
 
 def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | None) -> list[Task]:
-    """Return the three tasks that the fab judges, and the hologram task with the models of the measured
-    prints.
+    """Return the three tasks that the fab judges, the hologram task with the models of the measured prints,
+    and the three tasks once more at reduced size.
 
     Args:
         out: folder of the comparison.
@@ -86,26 +89,37 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
     """
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     fab = {"fab": str(out / "fab" / "truth")}
-    hoe = task_options(
-        "--target", "text", "--size-px", effort.hoe_px,
-        "--distance-um", effort.hoe_distance_um, "--iterations", effort.hoe_iterations,
-        "--precision", effort.search_precision, *_FEW_DRAWS,
-    )  # fmt: skip
-    lens = task_options(
-        "--size-px", effort.lens_px, "--distance-um", effort.lens_distance_um,
-        "--iterations", effort.lens_iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
-    )  # fmt: skip
-    camera = task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
     # No virtual fab simulates the measured printer. Therefore, the model of each arm judges the designs of
     # the other arms.
     measured = {arm: zoo.get(arm, "none") for arm in ZOO_ARMS}
     measured |= {} if corrected is None else {"closed-loop": corrected}
+
+    def judged_by_fab(scale: float, seeds: int, suffix: str = "") -> list[Task]:
+        return [
+            Task(f"{name}{suffix}", kind, _options(effort, kind, scale), models, fab, seeds)
+            for name, kind in KINDS.items()
+        ]
+
     return [
-        Task("hoe", "hoe", hoe, models, fab, effort.seeds),
-        Task("lens-direct", "direct", lens, models, fab, effort.seeds),
-        Task("lens-computational", "computational", lens + camera, models, fab, effort.seeds),
-        Task("hoe-measured", "hoe", hoe, measured, {}, effort.zoo_seeds),
+        *judged_by_fab(1.0, effort.seeds),
+        Task("hoe-measured", "hoe", _options(effort, "hoe"), measured, {}, effort.zoo_seeds),
+        *judged_by_fab(effort.reduced_to, effort.reduced_seeds, REDUCED),
     ]
+
+
+def _options(effort: Effort, kind: str, scale: float = 1.0) -> tuple[str, ...]:
+    """Return the options of the commands that make and judge the designs of one kind."""
+    element = "hoe" if kind == "hoe" else "lens"
+    iterations = effort.hoe_iterations if kind == "hoe" else effort.lens_iterations
+    words = [
+        "--size-px", effort.side_px(element, scale), "--distance-um", effort.distance_um(element, scale),
+        "--iterations", iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
+    ]  # fmt: skip
+    if kind == "hoe":
+        words = ["--target", "text", *words]
+    if kind == "computational":
+        words += ["--window-px", effort.window_px, "--object-px", effort.object_px]
+    return tuple(map(str, words))
 
 
 def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
@@ -120,8 +134,3 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
     if unknown := [name for name in wanted if name not in known]:
         raise InputError("tasks", got=", ".join(unknown), wanted=f"some of {', '.join(known)}")
     return [task for task in every if task.name in wanted]
-
-
-def task_options(*words: object) -> tuple[str, ...]:
-    """Return the options of a command as texts."""
-    return tuple(map(str, words))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from itertools import pairwise
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from benchmarks.gap.jobs import Job, run_commands
 from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
 from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
-from benchmarks.gap.tasks import Task, chosen, tasks
+from benchmarks.gap.tasks import KINDS, REDUCED, Task, chosen, tasks
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import Workers
@@ -113,10 +114,25 @@ def test_finished_jobs_are_skipped_and_failed_ones_are_named(tmp_path):
 
 def test_the_model_of_a_closed_loop_is_an_arm_of_the_measured_task_only(tmp_path):
     zoo = {name: f"zoo/{name}" for name in ("physics", "fno", "pbl", "random-features")}
-    *others, measured = tasks(tmp_path, TINY, zoo, "loop/model")
-    assert dict(measured.models) == {"none": "none", **zoo, "closed-loop": "loop/model"}
-    assert all("closed-loop" not in task.models for task in others)
-    assert "closed-loop" not in tasks(tmp_path, TINY, zoo, None)[-1].models
+    by_name = {task.name: task.models for task in tasks(tmp_path, TINY, zoo, "loop/model")}
+    assert dict(by_name.pop("hoe-measured")) == {"none": "none", **zoo, "closed-loop": "loop/model"}
+    assert all("closed-loop" not in models for models in by_name.values())
+    assert all("closed-loop" not in task.models for task in tasks(tmp_path, TINY, zoo, None))
+
+
+def test_a_reduced_task_has_the_same_geometry_and_more_seeds(tmp_path):
+    by_name = {task.name: task for task in tasks(tmp_path, Effort(), {}, None)}
+    reduced = {name for name in by_name if name.endswith(REDUCED)}
+    assert reduced == {f"{name}{REDUCED}" for name in KINDS}
+    for name in KINDS:
+        full, small = (dict(pairwise(by_name[one].options)) for one in (name, f"{name}{REDUCED}"))
+        # The side and the distance become smaller together, so the aperture stays the same.
+        for option in ("--size-px", "--distance-um"):
+            assert float(small.pop(option)) == float(full.pop(option)) / 4
+        assert [word for word in small if word.startswith("--")] == [
+            word for word in full if word.startswith("--")
+        ]
+        assert by_name[f"{name}{REDUCED}"].seeds == 10
 
 
 def test_a_page_with_some_of_the_tasks_is_not_published(tmp_path, monkeypatch, capsys):
@@ -161,6 +177,14 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     assert "| 58 % |" in text
     assert "those designed with pbl have the best" in text
     assert "2.000 (-0.500 to 4.500, which includes 0) than without a model" in text
+    # A task at reduced size, with more seeds, names the best arm in its place.
+    pairs = [{**pair, "mean": 3.0, "ci95": [2.0, 4.0]}]
+    record["tasks"]["hoe-reduced"] = {**record["tasks"]["hoe"], "seeds": [*range(10)], "paired": pairs}
+    record["summary"] = [*rows, *({**item, "task": "hoe-reduced"} for item in rows)]
+    text = as_markdown(record)
+    assert "elements of 0.25 of this size and 10 seeds" in text
+    assert "3.000 (2.000 to 4.000) than without a model" in text
+    assert "includes 0" not in text
 
 
 def test_the_page_quotes_the_committed_comparison():
