@@ -29,7 +29,7 @@ from litho_models.loop.errors import REPORTED, HeldOut, error_rows, nested_error
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.record import CloseLoop, Explained
+from litho_models.loop.record import CloseLoop, Explained, FoundEffect
 from litho_models.loop.report import said
 from litho_models.loop.results import _strengths, _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, save_model
@@ -228,6 +228,25 @@ def test_the_card_of_the_corrected_model_states_its_error_on_held_out_scans(clos
     assert stated is not None
     assert (stated.value, stated.ci95, stated.policy) == (row.mae_nm, row.mae_ci95_nm, row.policy)
     assert f"Mean absolute error {stated.text}" in (out / "model" / "README.md").read_text("utf-8")
+
+
+def test_a_set_is_reported_with_the_experiment_that_parts_it() -> None:
+    one = FoundEffect.model_construct(
+        name="galvo-lag",
+        title="lag",
+        by="all",
+        strengths={},
+        confusable_with=[],
+        separating_experiment="turn the print",
+        gain_nm2=9.0,
+        before_nm2=90.0,
+        scans_improved=(8, 9),
+        survives_on=[],
+    )
+    pair = (one, one.model_copy(update={"confusable_with": ["feedback-lag"]}))
+    told = [said("effect", effect) for effect in pair]
+    assert "distinguish" not in told[0]
+    assert "cannot distinguish it from feedback-lag. This would: turn the print." in told[1]
 
 
 def test_a_folder_of_the_loop_is_frozen_as_its_model(closed, tmp_path: Path) -> None:
