@@ -36,7 +36,7 @@ TARGETS = ("ring", "text", "letters", "spots", "chart")
 DESIGNED_BY = "zoo:physics"
 PRINTED_BY = ("zoo:pbl", "zoo:random-features", "zoo:blur-table", "zoo:affine-mtf", "zoo:features")
 SETTINGS = {"layout.size_px": 128, "optics.distance_um": 25, "search.iterations": 60, "window.yield_draws": 2}
-KINDS = ("photograph", "scan")
+KINDS = ("photograph", "scan", "scan without substrate")
 _FINER = 4
 
 
@@ -135,10 +135,14 @@ def photograph(
     return PhotoSource(file, camera.pitch_um, pitch_sd=pitch_sd, dark_level=dark if known else None)
 
 
-def scan(loaded: LoadedDesign, height: torch.Tensor, rng: np.random.Generator, file: Path) -> MeasuredSource:
-    """Scan a print, and return what the user would state about the scan."""
+def scan(
+    loaded: LoadedDesign, height: torch.Tensor, rng: np.random.Generator, file: Path, margin_px: int
+) -> MeasuredSource:
+    """Scan a print and ``margin_px`` pixels of substrate around it. Return what the user would state about
+    the scan.
+    """
     pitch_um = loaded.record.layout.pitch_um
-    around = np.pad(height.double().numpy(), 16)
+    around = np.pad(height.double().numpy(), margin_px)
     size = len(around)
     turn = np.asarray(
         cv2.getRotationMatrix2D((size / 2, size / 2), rng.normal(0, 1.5), 1 + rng.normal(0, 0.005)), float
@@ -165,7 +169,8 @@ def measure(
             source = photograph(loaded, height, rng, folder / "photo.png")
             found = judge_design(loaded, [], camera=source).scores[0]
         else:
-            found = judge_design(loaded, [], scan=scan(loaded, height, rng, folder / "scan.txt")).scores[0]
+            scanned = scan(loaded, height, rng, folder / "scan.txt", 16 if kind == "scan" else 3)
+            found = judge_design(loaded, [], scan=scanned).scores[0]
     except InputError as error:
         return {"kind": kind, "refused": str(error)}
     assert found.uncertainty is not None
@@ -177,15 +182,16 @@ def measure(
     }
 
 
-def designs(folder: Path) -> dict[str, LoadedDesign]:
-    """Return the designs by target; make those that are missing."""
+def designs(folder: Path, seed: int) -> dict[str, LoadedDesign]:
+    """Return the designs by target, with searches of this seed; make those that are missing."""
+    settings = hologram_settings(changes={**SETTINGS, "search.seed": seed})
     for target in TARGETS:
         if not (folder / target / "design.json").exists():
             design_hologram(
                 target,
                 DESIGNED_BY,
                 folder / target,
-                settings=hologram_settings(changes=SETTINGS),
+                settings=settings,
                 judges=(),
                 announce=False,
             )
@@ -219,17 +225,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=200, help="measurements of each kind")
     given = parser.parse_args()
-    loaded = designs(given.cache)
+    folder = given.cache / str(given.seed)
+    loaded = designs(folder, given.seed)
     layout = next(iter(loaded.values())).record.layout
     printers = {name: load_printer(name, layout) for name in PRINTED_BY}
     rows = []
     for number in range(given.count):
         for place, kind in enumerate(KINDS):
-            file = given.cache / f"{given.seed}" / f"{kind}-{number}.json"
             rng = np.random.default_rng([given.seed, number, place])
-            file.parent.mkdir(parents=True, exist_ok=True)
             own = loaded[TARGETS[number % len(TARGETS)]]
-            rows.append(kept(file, partial(measure, kind, own, rng, printers, file.parent)))
+            found = partial(measure, kind, own, rng, printers, folder)
+            rows.append(kept(folder / f"{kind}-{number}.json", found))
             print(number, rows[-1], flush=True)
     record = {"run": origin(), "seed": given.seed, "rows": rows}
     conclude(record, text_of(record), given.out, PAGE, "coverage", published=given.publish)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import torch
@@ -36,6 +36,13 @@ _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 _LARGEST_DUSTY_SHARE, _LIKE_HEIGHT_UM = 0.3, 0.005
 # Standard deviation of the height correction for the AFM tip, as a share of this correction.
 _TIP_SD = 0.3
+# Tilt and bow are fitted to the bare substrate around the print if enough of it was measured. The substrate
+# closer to the print than ``_FOOT_UM`` is left out, because blur and the tip raise it there. On every side,
+# at least the share ``_BARE_SHARE`` of the pixels within an eighth of the element must be measured. The
+# spread of the heights must be at most ``_FLAT_UM``; otherwise, the substrate is not bare.
+_FOOT_UM, _BARE_SHARE, _FLAT_UM = 0.5, 0.3, 0.02
+# Roughness of a substrate is correlated, so this number of pixels counts as one independent height.
+_ALIKE_PX = 25
 # Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
@@ -43,6 +50,7 @@ _ORDERS = (3, 4, 5, 6)
 # factor ``_LARGER``. In addition, all terms of tilt and bow may have one common relative error, whose
 # standard deviation is ``_COMMON_SD``. Both numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
+_FITTED: dict[Levelling, tuple[int, ...]] = {"none": (), "plane": (1,), "bow": (1, 2)}
 # Number of groups into which the pixels are divided by their expected height.
 _HEIGHTS = 32
 
@@ -52,12 +60,13 @@ class MeasuredRecord(Record):
 
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
     ``tilt_um_per_um`` (x, y) is the removed tilt, and ``bow_um`` is the height range of the removed bow over
-    the element. ``noise_um`` is the standard deviation of the noise, estimated from spatial frequencies at
-    which prints have no structure. Levelling also removes tilt and bow of the print itself. ``removed_sd_um``
-    is the expected standard deviation of each of these terms of the print. ``position_sd_um`` is the standard
-    deviation of the position of a corner along one axis, and ``scale_sd`` is the relative standard deviation
-    of the height scale. ``defect_share`` is the share of the element that shows dust or scars instead of the
-    print.
+    the element. They were measured on the bare substrate around the print (``levelled_on`` is ``substrate``),
+    or together with the gain of the expected print (``print``), which also removes tilt and bow of the print
+    itself. ``removed_sd_um`` contains the standard deviation of each of these terms (x, y, x², xy, y²).
+    ``noise_um`` is the standard deviation of the noise, estimated from spatial frequencies at which prints
+    have no structure. ``position_sd_um`` is the standard deviation of the position of a corner along one
+    axis, and ``scale_sd`` is the relative standard deviation of the height scale. ``defect_share`` is the
+    share of the element that shows dust or scars instead of the print.
     """
 
     name: str
@@ -69,9 +78,10 @@ class MeasuredRecord(Record):
     orientation: str
     warning: str
     levelling: Levelling
+    levelled_on: Literal["substrate", "print"]
     tilt_um_per_um: tuple[float, float]
     bow_um: float
-    removed_sd_um: float
+    removed_sd_um: list[float]
     noise_um: float
     position_sd_um: float
     scale_sd: float
@@ -92,7 +102,12 @@ class MeasuredRecord(Record):
         else:
             x, y = self.tilt_um_per_um
             found.append(
-                f"a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm were removed"
+                f"a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm were removed, "
+                + (
+                    "as measured on the bare substrate around the print"
+                    if self.levelled_on == "substrate"
+                    else "which may hide tilt and bow of the print itself"
+                )
             )
         if self.defect_share:
             found.append(
@@ -107,21 +122,24 @@ class MeasuredRecord(Record):
         return found
 
 
-def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor, MeasuredRecord]:
+def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor, MeasuredRecord, Tensor]:
     """Resample the measured heights of a printed design onto the pixels of its layout.
 
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
     set so that the median difference between the measured and the expected print is 0. The expected print is
-    the one that was predicted when the layout was designed. Tilt and bow of the scanner are fitted together
-    with the gain of the expected print, so that the tilt and bow of the expected print are not removed.
-    Unmeasured pixels are filled with the heights of the expected print.
+    the one that was predicted when the layout was designed. Tilt and bow of the scanner are fitted to the
+    bare substrate around the print. If the scan does not show enough of it, they are fitted together with the
+    gain of the expected print, so that the tilt and bow of the expected print are not removed. Unmeasured
+    pixels are filled with the heights of the expected print.
 
     Args:
         loaded: the design.
         source: the scan, in any format that ``litho-data inspect`` reads.
 
     Returns:
-        The height of the print, µm, shape (size, size), and the record of the measurement.
+        The height of the print, µm, shape (size, size), the record of the measurement, and a map of the same
+        shape. It contains the height, µm, that the print itself may have in addition where it was taken for
+        dust or a scar.
 
     Raises:
         InputError: the scan cannot be registered, covers too little of the element, or does not resemble the
@@ -138,7 +156,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     place = _as_it_lies if source.aligned else _registered
     scan, tip_um, tip_change_um = _without_tip(scan, source.tip_um)
     placed = place(scan, loaded.level.cpu().numpy(), layout.pitch_um)
-    height, valid, coverage = placed.height_um, placed.valid, float(placed.valid.mean())
+    height, valid = (placed.inner(one) for one in (placed.height_um, placed.valid))
+    coverage = float(valid.mean())
     if coverage < _SMALLEST_COVERAGE:
         raise InputError(
             f"scan {source.path}",
@@ -147,10 +166,11 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
             hint="a hologram needs its whole area; stitch the scans first",
         )
     expected = loaded.expected_um.cpu().numpy()
-    background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
+    bare = substrate_background(placed, layout.pitch_um, source.levelling)
+    background = bare or fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     defects = _defects(np.where(valid, height - background.map_um - expected, 0.0), expected, valid)
     valid = valid & ~defects
-    background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
+    background = bare or fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     levelled = height - background.map_um
     ncc = float(np.corrcoef(levelled[valid], expected[valid])[0, 1])
     if not ncc >= _SMALLEST_NCC:
@@ -162,6 +182,9 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         )
     offset = float(np.median(levelled[valid] - expected[valid]))
     complete = np.where(valid, levelled - offset, expected).astype(np.float32)
+    # Up to the nominal height of the highest level, the print itself may be what looks like dust.
+    plausible = np.clip(levelled - offset, 0, (layout.levels - 1) * layout.level_height_um)
+    doubt = np.where(defects, plausible - expected, 0.0).astype(np.float32)
     record = MeasuredRecord(
         name=Path(source.path).name,
         sha256=file_sha256(source.path),
@@ -172,9 +195,10 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         orientation=placed.orientation,
         warning=placed.warning,
         levelling=source.levelling,
+        levelled_on="substrate" if bare else "print",
         tilt_um_per_um=background.tilt_um_per_um,
         bow_um=background.bow_um,
-        removed_sd_um=_removed_sd_um(complete - expected, expected),
+        removed_sd_um=bare.sd_um if bare else [_removed_sd_um(complete - expected, expected)] * 5,
         noise_um=white_noise(complete - expected),
         position_sd_um=placed.position_sd_um,
         scale_sd=source.scale_sd,
@@ -182,7 +206,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         tip_um=tip_um,
         tip_change_um=tip_change_um,
     )
-    return torch.from_numpy(complete).to(loaded.device), record
+    return torch.from_numpy(complete).to(loaded.device), record, torch.from_numpy(doubt).to(loaded.device)
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
@@ -243,16 +267,22 @@ def _defects(off_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray) -> 
 
 
 class _Placed(NamedTuple):
-    """A scan resampled on the pixels of the layout. It contains the heights and the mask of measured pixels,
-    both of shape (ny, nx), the orientation, a warning, and the standard deviation of a corner's position
-    along one axis.
+    """A scan resampled on the pixels of the layout and of ``margin_px`` pixels around it. It contains the
+    heights and the mask of measured pixels, both of shape (ny + 2 margin, nx + 2 margin), the orientation, a
+    warning, and the standard deviation of a corner's position along one axis.
     """
 
     height_um: np.ndarray
     valid: np.ndarray
+    margin_px: int = 0
     orientation: str = "identity"
     warning: str = ""
     position_sd_um: float = 0.0
+
+    def inner(self, one: np.ndarray) -> np.ndarray:
+        """Return the part of a map that lies on the layout, of shape (ny, nx)."""
+        ny, nx = one.shape
+        return one[self.margin_px : ny - self.margin_px, self.margin_px : nx - self.margin_px]
 
 
 def _as_it_lies(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
@@ -279,23 +309,38 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
             wanted="a match",
             hint="use --scan-aligned if the scan has the pixels of the element",
         )
+    margin_px = min(level.shape) // 8
+    moved = np.eye(3)
+    moved[:2, 2] = margin_px * pitch_um
     height, valid = resample_to_layout(
-        scan.height_um, found.scan_to_layout, level.shape, **pitches, bend_um=found.bend_um
-    )
+        scan.height_um, moved @ found.scan_to_layout, tuple(size + 2 * margin_px for size in level.shape),
+        **pitches, bend_um=found.bend_um,
+    )  # fmt: skip
     # ``corner_sd_nm`` combines both axes, so it is divided by sqrt(2) for one axis.
     position_sd_um = quality.corner_sd_nm / 1000 / math.sqrt(2)
-    return _Placed(height, valid, quality.dihedral, quality.warning, position_sd_um)
+    return _Placed(height, valid, margin_px, quality.dihedral, quality.warning, position_sd_um)
 
 
 @dataclass(frozen=True)
 class Background:
-    """Tilt and bow of a scan. ``map_um`` is their sum, shape (ny, nx), with zero mean. The other fields are
-    the slopes of the tilt along x and y, and the range of the bow.
+    """Tilt and bow of a scan. ``map_um`` is their sum, shape (ny, nx). The other fields are the slopes of the
+    tilt along x and y, the range of the bow, and the standard deviation of each term.
     """
 
     map_um: np.ndarray
     tilt_um_per_um: tuple[float, float]
     bow_um: float
+    sd_um: list[float]
+
+    @classmethod
+    def of(cls, terms_um: np.ndarray, shape: tuple[int, int], pitch_um: float, sd_um: list[float]) -> Self:
+        """Make the background with the given coefficients of x, y, x², xy and y² (see ``_shapes``)."""
+        terms_um = np.pad(terms_um, (0, 5 - len(terms_um)))
+        shapes = _shapes(shape, (1, 2))
+        bow = shapes[..., 2:] @ terms_um[2:]
+        lengths_um = [(size - 1) / 2 * pitch_um for size in shape[::-1]]
+        x, y = (math.sqrt(3) * term / length for term, length in zip(terms_um, lengths_um, strict=False))
+        return cls(shapes @ terms_um, (float(x), float(y)), float(np.ptp(bow)), sd_um)
 
 
 def fitted_background(
@@ -304,22 +349,36 @@ def fitted_background(
     """Fit the tilt and bow of a scan, together with the gain of the expected print, by least squares. All
     maps have shape (ny, nx).
     """
-    ny, nx = height_um.shape
-    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
-    terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
-    columns = np.stack([*terms, expected_um, np.ones_like(x)], axis=-1)
+    shapes = _shapes(height_um.shape, _FITTED[levelling])
+    columns = np.dstack([shapes, expected_um, np.ones_like(expected_um)])
     found, *_ = np.linalg.lstsq(columns[valid], height_um[valid].astype(float), rcond=None)
-    slopes = found[:2] if terms else np.zeros(2)
-    bow = columns[..., 2 : len(terms)] @ found[2 : len(terms)]
-    tilt = slopes[0] * x + slopes[1] * y if terms else np.zeros_like(x)
-    return Background(
-        map_um=tilt + bow - bow.mean(),
-        tilt_um_per_um=(
-            float(2 * slopes[0] / (nx - 1) / pitch_um),
-            float(2 * slopes[1] / (ny - 1) / pitch_um),
-        ),
-        bow_um=float(np.ptp(bow)),
-    )
+    return Background.of(found[:-2], expected_um.shape, pitch_um, [])
+
+
+def substrate_background(placed: _Placed, pitch_um: float, levelling: Levelling) -> Background | None:
+    """Fit the tilt and bow of a scan to the bare substrate around the print, without pixels that deviate.
+    Return None if the scan does not show enough of it, or if it is not flat.
+    """
+    margin, foot = placed.margin_px, math.ceil(_FOOT_UM / pitch_um)
+    width, shape = margin - foot, placed.inner(placed.valid).shape
+    if width < 1 or levelling == "none":
+        return None
+    bare = placed.valid.copy()
+    bare[width:-width, width:-width] = False
+    sides = bare[:width], bare[-width:], bare[:, :width], bare[:, -width:]
+    if min(side.mean() for side in sides) < _BARE_SHARE:
+        return None
+    columns = np.dstack([_shapes(shape, (0, *_FITTED[levelling]), margin)])
+    for _ in range(3):
+        seen, height = columns[bare], placed.height_um[bare].astype(float)
+        found, *_ = np.linalg.lstsq(seen, height, rcond=None)
+        rest = np.abs(height - seen @ found)
+        spread_um = 1.4826 * float(np.median(rest))
+        bare[bare] = rest < 4 * spread_um
+    if spread_um > _FLAT_UM or min(side.mean() for side in sides) < _BARE_SHARE:
+        return None
+    variances = np.diag(np.linalg.inv(seen.T @ seen))[1:] * _ALIKE_PX
+    return Background.of(found[1:], shape, pitch_um, (spread_um * np.sqrt(variances)).tolist())
 
 
 def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tensor]:
@@ -344,22 +403,28 @@ def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float)
         yield from _pair(_TIP_SD * (narrower - measured), height_um)
 
 
-def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, that registration and levelling cannot distinguish from
+def with_other_fits(
+    height_um: Tensor, record: MeasuredRecord, pitch_um: float, doubt_um: Tensor
+) -> Iterator[Tensor]:
+    """Yield pairs of prints of shape (ny, nx), in µm, that the processing of the scan cannot distinguish from
     the measured print. The two prints of a pair differ from the measured print in one quantity: by plus its
     standard deviation in the first, and by minus it in the second. This quantity is a term of the print's own
-    tilt and bow, a factor common to all these terms, or a parameter of the affine registration.
+    tilt and bow, a factor common to all these terms (unless they were measured on the substrate), a parameter
+    of the affine registration, or the share of ``doubt_um`` that belongs to the print instead of dust.
     """
     measured = height_um.double().cpu().numpy()
-    removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
-    for shape in np.moveaxis(removed, -1, 0):
-        yield from _pair(record.removed_sd_um * shape, height_um)
-    if removed.size:
+    removed = _shapes(measured.shape, _FITTED[record.levelling])
+    for shape, sd_um in zip(np.moveaxis(removed, -1, 0), record.removed_sd_um, strict=False):
+        yield from _pair(sd_um * shape, height_um)
+    if removed.size and record.levelled_on == "print":
         yield from _pair(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed), height_um)
     for step in np.eye(6).reshape(6, 2, 3) if record.position_sd_um else ():
         for sign in (1, -1):
             corner_px = sign * record.position_sd_um / pitch_um * step
             yield torch.from_numpy(_displaced(measured, corner_px)).to(height_um)
+    if doubt_um.any():
+        # If none and all of it are equally likely, its standard deviation is one half.
+        yield from _pair(0.5 * doubt_um.double().cpu().numpy(), height_um)
 
 
 def _pair(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:
@@ -385,16 +450,19 @@ def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
     return found
 
 
-def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
+def _shapes(shape: tuple[int, ...], orders: Iterable[int], margin_px: int = 0) -> np.ndarray:
     """Return all products of a Legendre polynomial in y and a Legendre polynomial in x whose two orders add
-    up to a number in ``orders``. Each product has an rms of 1. The result has shape (ny, nx, number of
-    products).
+    up to a number in ``orders``. Each product has an rms of 1 over ``shape``, which is (ny, nx). The result
+    has shape (ny + 2 margin, nx + 2 margin, number of products), because it continues beyond ``shape``.
     """
-    y, x = (np.linspace(-1, 1, size) for size in shape)
+    reaches = (1 + 2 * margin_px / (size - 1) for size in shape)
+    y, x = (
+        np.linspace(-reach, reach, size + 2 * margin_px) for reach, size in zip(reaches, shape, strict=True)
+    )
     pairs = [(i, order - i) for order in orders for i in range(order + 1)]
     along = [[math.sqrt(2 * n + 1) * Legendre.basis(n)(at) for n in range(max(_ORDERS) + 1)] for at in (y, x)]
     products = [np.outer(along[0][i], along[1][j]) for i, j in pairs]
-    return np.stack(products, axis=-1) if products else np.zeros((*shape, 0))
+    return np.stack(products, axis=-1) if products else np.zeros((len(y), len(x), 0))
 
 
 def _removed_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:

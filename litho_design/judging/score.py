@@ -150,8 +150,8 @@ def judge_design(
         scores.append(_print_score(loaded, record, height))
         pictures[f"printed by {record.name}"] = loaded.image(height)
     if scan is not None:
-        printed_um, measured = measured_print(loaded, scan)
-        scores.append(_print_score(loaded, measured, printed_um))
+        printed_um, measured, doubt_um = measured_print(loaded, scan)
+        scores.append(_print_score(loaded, measured, printed_um, doubt_um))
         pictures[f"measured print {measured.name}"] = loaded.image(printed_um)
     if camera is not None:
         of_lens = isinstance(loaded.task, LensTask)
@@ -181,14 +181,22 @@ def judge_design(
     return Judgement(scores, shown, loaded.window_um, photos, loaded.frame_um)
 
 
-def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
-    """Score a predicted or measured print, and compare its height with the designed height."""
+def _print_score(
+    loaded: LoadedDesign,
+    judge: PrinterRecord | MeasuredRecord,
+    height: Tensor,
+    doubt_um: Tensor | None = None,
+) -> JudgedScore:
+    """Score a predicted or measured print, and compare its height with the designed height. ``doubt_um`` is
+    given for a measured print (see ``measured_print``).
+    """
     scored, spread = loaded.score(height), None
     figures = scored.model_dump()
-    measured = isinstance(judge, MeasuredRecord)
-    if isinstance(judge, MeasuredRecord):
+    measured = doubt_um is not None
+    if isinstance(judge, MeasuredRecord) and doubt_um is not None:
         pitch_um = loaded.record.layout.pitch_um
-        left, hidden = with_other_scale(height, judge, pitch_um), with_other_fits(height, judge, pitch_um)
+        left = with_other_scale(height, judge, pitch_um)
+        hidden = with_other_fits(height, judge, pitch_um, doubt_um)
         figures, spread = estimated(loaded.score, scored, with_more_noise(height, judge), left, hidden)
     off = (height - loaded.expected_um).double()
     in_rings = loaded.record.in_rings

@@ -217,7 +217,7 @@ def _first_print(
         raise InputError(
             f"design {after}", got="another layout", wanted="a design with the same size, pitch and levels"
         )
-    printed_um, _ = measured_print(first, scan)
+    printed_um, *_ = measured_print(first, scan)
     return {"first_level": first.level.numpy(), "first_print_um": printed_um.numpy()}
 
 

@@ -34,10 +34,12 @@ from litho_design.judging.measured import (
     MeasuredRecord,
     _defects,
     _displaced,
+    _Placed,
     _removed_sd_um,
     _shapes,
     _without_tip,
     fitted_background,
+    substrate_background,
     with_other_fits,
     with_other_scale,
 )
@@ -409,9 +411,18 @@ def test_the_steps_of_an_affine_map_add_up_to_the_standard_deviation_at_the_corn
 @pytest.mark.parametrize(("levelling", "terms"), [("none", 0), ("plane", 2), ("bow", 5)])
 def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     height_um = torch.linspace(0, 0.8, 96).repeat(64, 1)
-    facts = {"removed_sd_um": 0.01, "position_sd_um": 0.05, "scale_sd": 0.02, "tip_um": 0.0}
-    record = MeasuredRecord.model_construct(levelling=levelling, **facts)
-    changes = torch.stack([one - height_um for one in with_other_fits(height_um, record, 0.1)])
+    facts = {"levelled_on": "print", "position_sd_um": 0.05, "scale_sd": 0.02, "tip_um": 0.0}
+    removed_sd_um = [0.01, 0.02, 0.03, 0.04, 0.05]
+    record = MeasuredRecord.model_construct(levelling=levelling, removed_sd_um=removed_sd_um, **facts)
+    doubt_um = torch.zeros_like(height_um)
+    doubt_um[10:14, 20:24] = 0.3
+    *pairs, plus, minus = with_other_fits(height_um, record, 0.1, doubt_um)
+    # None or all of the doubtful height belongs to the print.
+    assert torch.allclose(plus - height_um, doubt_um / 2)
+    assert torch.allclose(minus - height_um, -doubt_um / 2)
+    certain = with_other_fits(height_um, record, 0.1, torch.zeros_like(height_um))
+    assert len(list(certain)) == len(pairs)
+    changes = torch.stack([one - height_um for one in pairs])
     plus, minus = changes.reshape(-1, 2, *height_um.shape).unbind(1)
     # The terms of tilt and bow, their common factor, and the six parameters of the registration.
     assert len(plus) == terms + bool(terms) + 6
@@ -420,7 +431,7 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     assert torch.allclose(plus[inside], -minus[inside], atol=1e-6)
     rms_um = plus[:terms].square().mean((1, 2)).sqrt().tolist()
     # On pixels, the terms have an rms of up to 1.04.
-    assert rms_um == pytest.approx([0.01] * terms, rel=0.04)
+    assert rms_um == pytest.approx(removed_sd_um[:terms], rel=0.04)
     # The first parameter of the registration moves the ramp along y, the fourth along x.
     slope, shift_px = 0.8 / 95, 0.05 / 0.1 / np.sqrt(7)
     assert plus[-6][inside[1:]].abs().max() == pytest.approx(0, abs=1e-6)
@@ -428,6 +439,70 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     (more, less) = with_other_scale(height_um, record, 0.1)
     assert torch.allclose(more, 1.02 * height_um)
     assert torch.allclose(more + less, 2 * height_um)
+
+
+# Tilt, µm per pixel, and bow, µm per squared pixel.
+TILT, BOW = 1e-3, 1e-5
+
+
+def on_substrate(print_um: np.ndarray, rough_um: np.ndarray | float = 0.0) -> _Placed:
+    """Return a scan that shows a print of 64 × 96 px with 12 px of flat substrate around it. The scanner adds
+    a tilt, a bow and noise of 2 nm.
+    """
+    y, x = np.mgrid[-44:44, -60:60] + 0.5
+    bent = TILT * x + BOW * (x * x - 2 * y * y)
+    noise = 0.002 * np.random.default_rng(2).standard_normal(bent.shape)
+    height = np.pad(print_um, 12) + rough_um + bent + noise
+    return _Placed(height, np.isfinite(height), 12)
+
+
+def test_a_bent_print_is_no_bent_scan_where_the_substrate_is_bare():
+    """Check that the bow of a print, which levelling on the print removes, stays if the substrate shows the
+    bow of the scanner.
+    """
+    y, x = np.mgrid[-32:32, -48:48] + 0.5
+    for own in (0.0, 3e-5):
+        found = substrate_background(on_substrate(0.4 - own * (x * x + y * y)), 0.1, "bow")
+        assert found is not None
+        # The coordinate x runs in pixels of 0.1 µm.
+        assert found.tilt_um_per_um == pytest.approx((0.01, 0.0), abs=1e-4)
+        wanted = TILT * x + BOW * (x * x - 2 * y * y)
+        # The noise of 2 nm on about 1,900 pixels, carried over to the print by five terms.
+        assert np.std(found.map_um - wanted) < 3e-4
+        assert max(found.sd_um) < 2e-3
+
+
+def test_the_standard_deviations_of_the_substrate_fit_hold():
+    """Check the stated deviations for noise that is alike over ``_ALIKE_PX`` pixels."""
+    rng, found, flat = np.random.default_rng(4), [], np.full((64, 96), 0.4)
+    for _ in range(40):
+        rough_um = 0.02 * cv2.blur(rng.standard_normal((88, 120)), (5, 5))
+        found.append(substrate_background(on_substrate(flat, rough_um), 0.1, "bow"))
+    seen_um = np.std([one.map_um for one in found], axis=0)
+    sd_um = np.mean([one.sd_um for one in found], axis=0)
+    stated_um = np.sqrt(_shapes((64, 96), (1, 2)) ** 2 @ sd_um**2)
+    # The terms are correlated a little, and 40 draws know a deviation to 11 %.
+    assert 0.6 < np.sqrt(np.mean(seen_um**2) / np.mean(stated_um**2)) < 1.3
+
+
+def test_a_substrate_that_is_hidden_or_not_flat_is_not_used():
+    flat = np.full((64, 96), 0.4)
+    assert substrate_background(on_substrate(flat), 0.1, "none") is None
+    dirty = on_substrate(flat)
+    dirty.height_um[40:44, 2:5] += 1.0
+    found = substrate_background(dirty, 0.1, "bow")
+    assert found is not None
+    # Twelve pixels of dust do not count.
+    assert found.tilt_um_per_um == pytest.approx((0.01, 0.0), abs=1e-4)
+    # A neighbouring print lies on the left.
+    printed = on_substrate(flat)
+    printed.height_um[:, :7] += 0.2 * np.random.default_rng(0).random((88, 7))
+    printed.height_um[:7] += 0.2 * np.random.default_rng(1).random((7, 120))
+    printed.height_um[-7:] += 0.2 * np.random.default_rng(1).random((7, 120))
+    assert substrate_background(printed, 0.1, "bow") is None
+    hidden = on_substrate(flat)
+    hidden.valid[:, -10:] = False
+    assert substrate_background(hidden, 0.1, "bow") is None
 
 
 def test_hidden_tilt_and_bow_are_extrapolated_from_higher_orders():
