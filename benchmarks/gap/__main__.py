@@ -42,10 +42,6 @@ def main() -> None:
 def _run(given: argparse.Namespace) -> None:
     out, logs = given.out, given.out / "logs"
     workers = Workers(given.workers, given.dask)
-    if given.publish and given.tasks:
-        raise InputError(
-            "--publish", got="together with --tasks", wanted="no --tasks, because the page shows all tasks"
-        )
     effort = Effort() if given.small is None else Effort.small(given.small)
     plan = open_plan(out, effort, None if given.corrected is None else str(given.corrected.resolve()))
     measured = {name: str(zoo.folder(name)) for name in zoo.list()}
@@ -57,10 +53,11 @@ def _run(given: argparse.Namespace) -> None:
         print(f"{task.name}: {len(task.designs(out))} designs", flush=True)
         run_commands(task.designs(out), logs, workers)
     run_commands([task.compare(out) for task in todo], logs, workers)
-    results = write_results(out, plan, todo)
-    print(f"{results} ({(time.monotonic() - started) / 3600:.2f} h in this run)")
-    if given.publish:
-        publish_results(out)
+    for part in dict.fromkeys(task.part for task in todo):
+        results = write_results(out, plan, [task for task in todo if task.part == part])
+        print(f"{results} ({(time.monotonic() - started) / 3600:.2f} h in this run)")
+        if given.publish:
+            publish_results(out, part)
 
 
 def _arguments() -> argparse.Namespace:

@@ -12,7 +12,7 @@ import pandas as pd
 from benchmarks.gap.figures import draw_images, draw_lens
 from benchmarks.gap.plan import ARMS, Plan
 from benchmarks.gap.tables import as_markdown, figure_file
-from benchmarks.gap.tasks import REDUCED, Task
+from benchmarks.gap.tasks import FAB, REDUCED, Task
 from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.tasks.design import Design
@@ -21,16 +21,16 @@ from litho_models.fitting.runs import TrainingRun
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "gap.md", DOCS / "results" / "gap"
-NAME = "gap"
 RESULT_FILE, TABLE_FILE = "gap.json", "gap.csv"
 
 
 def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
-    """Write the record, the tables and the figures of a finished comparison into the folder ``results/``
-    below ``out``. Return that folder.
+    """Write the record, the tables and the figures of finished tasks, which are all of one part of the
+    comparison, into a folder below ``out/results``. Return that folder.
     """
-    folder = out / "results"
-    folder.mkdir(exist_ok=True)
+    part = tasks[0].part
+    folder = out / "results" / part
+    folder.mkdir(parents=True, exist_ok=True)
     gaps = {task.name: GapResult.read(out / task.name) for task in tasks}
     summary = pd.concat([_frame(name, gap) for name, gap in gaps.items()])
     summary.to_csv(folder / TABLE_FILE, index=False, float_format="%.6g")
@@ -40,7 +40,7 @@ def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
         "machine": {"cores": usable_cores(), "threads_per_process": 1},
         **origin(),
         "training_scans": len(TrainingRun.read(out / "runs" / ARMS[1]).training_ids),
-        "models": _models(out),
+        "models": _models(out) if part == FAB else {},
         "tasks": {
             name: {
                 "target": gap.target,
@@ -66,14 +66,17 @@ def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
     return folder
 
 
-def publish_results(out: Path) -> None:
-    """Copy the folder ``results/`` into the documentation, and write its tables into the page."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for file in sorted((out / "results").iterdir()):
+def publish_results(out: Path, part: str) -> None:
+    """Copy the folder ``results/`` into a folder of the documentation, and write its tables into the page.
+    ``part`` is the part of the comparison (see ``Task.part``).
+    """
+    folder = RESULTS / part
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in sorted((out / "results" / part).iterdir()):
         if file.suffix != ".md":
-            shutil.copyfile(file, RESULTS / file.name)
-    record = json.loads((RESULTS / RESULT_FILE).read_text(encoding="utf-8"))
-    publish(PAGE, NAME, as_markdown(record))
+            shutil.copyfile(file, folder / file.name)
+    record = json.loads((folder / RESULT_FILE).read_text(encoding="utf-8"))
+    publish(PAGE, f"gap-{part}", as_markdown(record))
 
 
 def _models(out: Path) -> dict[str, dict[str, float]]:

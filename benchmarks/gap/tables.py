@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.gap.tasks import REDUCED
+from benchmarks.gap.tasks import FAB, MEASURED, REDUCED
 
 # The scores that the table of each task shows, with +1 if a higher score is better and -1 if a lower one is.
 SHOWN = {
@@ -38,16 +38,7 @@ TITLES = {
 
 def as_markdown(record: Mapping[str, Any]) -> str:
     """Return all tables of a record, each with the conditions under which it was made."""
-    effort = record["plan"]["effort"]
-    knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
-    parts = [
-        f"Strengths of the fab's effects (10 nm rms each): {knobs}. The models were trained on "
-        f"{record['training_scans']} of {effort['scans']} scans of its prints, each {effort['scan_px']} px "
-        f"wide. The networks were trained for {effort['training_steps']:,} steps. "
-        f"{_precision_text(effort['search_precision'])} In the tables of designs, a cell contains the score "
-        "predicted by the model of the design, an arrow, the score after printing, and ± half of its 95 % "
-        "interval (Student's t) over seeds.\n\n" + _model_table(record["models"])
-    ]
+    parts = [_fab_text(record)] if record["models"] else []
     for name, task in record["tasks"].items():
         if not name.endswith(REDUCED):
             parts.append(_task_part(name, task, _rows(record, name), _best_arm(record, name)))
@@ -58,6 +49,19 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "of a busy computer."
     )
     return "\n\n".join(parts)
+
+
+def _fab_text(record: Mapping[str, Any]) -> str:
+    effort = record["plan"]["effort"]
+    knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
+    return (
+        f"Strengths of the fab's effects (10 nm rms each): {knobs}. The models were trained on "
+        f"{record['training_scans']} of {effort['scans']} scans of its prints, each {effort['scan_px']} px "
+        f"wide. The networks were trained for {effort['training_steps']:,} steps. "
+        f"{_precision_text(effort['search_precision'])} In the tables of designs, a cell contains the score "
+        "predicted by the model of the design, an arrow, the score after printing, and ± half of its 95 % "
+        "interval (Student's t) over seeds.\n\n" + _model_table(record["models"])
+    )
 
 
 def _precision_text(search: str) -> str:
@@ -136,7 +140,8 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         reached = ", ".join(f"{LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
         head += f" A continuous phase on the same grid, without printer or levels, reaches {reached}."
     head += "\n\n"
-    picture = f"![{_FIGURES[kind]}](results/gap/{figure_file(name)})"
+    part = FAB if independent else MEASURED
+    picture = f"![{_FIGURES[kind]}](results/gap/{part}/{figure_file(name)})"
     return "\n\n".join(part for part in (head + "\n".join(lines), verdict, picture) if part)
 
 

@@ -15,6 +15,7 @@ from litho_data.foundation.errors import InputError
 # The tasks that the fab judges, with the kind of their designs.
 KINDS = {"hoe": "hoe", "lens-direct": "direct", "lens-computational": "computational"}
 REDUCED = "-reduced"
+FAB, MEASURED = "fab", "measured"
 ZOO_ARMS = ("none", "physics", "fno", "pbl", "random-features")
 
 
@@ -30,6 +31,13 @@ class Task:
     models: Mapping[str, str]
     judges: Mapping[str, str]
     seeds: int
+
+    @property
+    def part(self) -> str:
+        """Return the part of the comparison to which the task belongs. The fab judges the first part, and the
+        models of the measured prints judge each other in the second part.
+        """
+        return FAB if self.judges else MEASURED
 
     @property
     def iterations(self) -> int:
