@@ -23,7 +23,7 @@ from benchmarks.gap.document import publish_results, write_results
 from benchmarks.gap.jobs import run_commands
 from benchmarks.gap.plan import Effort, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
-from benchmarks.gap.tasks import FAB, chosen, tasks
+from benchmarks.gap.tasks import FAB, chosen, require_whole_parts, tasks
 from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import Workers
@@ -43,18 +43,22 @@ def _run(given: argparse.Namespace) -> None:
     out, logs = given.out, given.out / "logs"
     workers = Workers(given.workers, given.dask)
     effort = Effort() if given.small is None else Effort.small(given.small)
-    plan = open_plan(out, effort, None if given.corrected is None else str(given.corrected.resolve()))
+    corrected = None if given.corrected is None else str(given.corrected.resolve())
     measured = {name: str(zoo.folder(name)) for name in zoo.list()}
-    todo = chosen(tasks(out, effort, measured, plan.corrected), given.tasks)
+    every = tasks(out, effort, measured, corrected)
+    todo = chosen(every, given.tasks)
+    if given.publish:
+        require_whole_parts(every, todo)
+    plan = open_plan(out, effort, corrected)
     started = time.monotonic()
     for stage in (*fab_jobs(out, effort), *model_jobs(out, effort)):
         run_commands(stage, logs, workers)
     for task in todo:
+        print(f"{task.name}: {task.seeds * len(task.models)} designs", flush=True)
         # A single design with a model of the zoo is also judged by the rest of the zoo. The comparison makes
         # such designs itself, with one model each.
-        jobs = task.designs(out) if task.part == FAB else []
-        print(f"{task.name}: {len(jobs)} designs", flush=True)
-        run_commands(jobs, logs, workers)
+        if task.part == FAB:
+            run_commands(task.designs(out), logs, workers)
     run_commands([task.compare(out) for task in todo], logs, workers)
     for part in dict.fromkeys(task.part for task in todo):
         results = write_results(out, plan, [task for task in todo if task.part == part])

@@ -51,7 +51,7 @@ class Effort(Record):
     object_px: int = 96
 
     def side_px(self, kind: str, scale: float = 1.0) -> int:
-        """Return the side of the elements, in pixels. ``kind`` is ``hoe`` or ``lens``."""
+        """Return the side of the elements, in pixels. ``kind`` is ``hoe``, or any other kind for a lens."""
         return round(scale * (self.hoe_px if kind == "hoe" else self.lens_px))
 
     def distance_um(self, kind: str, scale: float = 1.0) -> float:

@@ -75,7 +75,13 @@ def _rows(record: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
 
 
 def _kind(name: str) -> str:
-    return next(kind for kind in ("lens-computational", "lens-direct", "hoe") if name.startswith(kind))
+    return next(kind for kind in SHOWN if name.startswith(kind))
+
+
+def _independent(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the judges that are no arms."""
+    arms = {row["arm"] for row in rows}
+    return [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge not in arms]
 
 
 def _best_arm(record: Mapping[str, Any], name: str) -> str:
@@ -87,13 +93,14 @@ def _best_arm(record: Mapping[str, Any], name: str) -> str:
     """
     reduced = f"{name}{REDUCED}" if f"{name}{REDUCED}" in record["tasks"] else name
     task, rows = record["tasks"][reduced], _rows(record, reduced)
-    arms = dict.fromkeys(row["arm"] for row in rows)
-    judge = next((row["judge"] for row in rows if row["judge"] not in arms), None)
-    if judge is None or len(task["seeds"]) < 2:
+    judges = _independent(rows)
+    if not judges or len(task["seeds"]) < 2:
         return ""
     figure, sign = next(iter(SHOWN[_kind(name)].items()))
-    means = {row["arm"]: row["judged"] for row in rows if (row["judge"], row["figure"]) == (judge, figure)}
-    told = lead_text(task["paired"], means, figure, sign, judge)
+    means = {
+        row["arm"]: row["judged"] for row in rows if (row["judge"], row["figure"]) == (judges[0], figure)
+    }
+    told = lead_text(task["paired"], means, figure, sign, judges[0])
     if reduced == name:
         return told
     scale, count = record["plan"]["effort"]["reduced_to"], len(task["seeds"])
@@ -105,7 +112,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     shown = SHOWN[kind]
     values = {(row["arm"], row["judge"], row["figure"]): row for row in rows}
     arms = list(dict.fromkeys(row["arm"] for row in rows))
-    judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge not in arms]
+    judges = _independent(rows)
     independent = bool(judges)
     if not independent:
         judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge != "none"]
@@ -140,8 +147,8 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         reached = ", ".join(f"{LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
         head += f" A continuous phase on the same grid, without printer or levels, reaches {reached}."
     head += "\n\n"
-    part = FAB if independent else MEASURED
-    picture = f"![{_FIGURES[kind]}](results/gap/{part}/{figure_file(name)})"
+    place = f"results/gap/{FAB if independent else MEASURED}/{figure_file(name)}"
+    picture = f"![{_FIGURES[kind]}]({place})"
     return "\n\n".join(part for part in (head + "\n".join(lines), verdict, picture) if part)
 
 

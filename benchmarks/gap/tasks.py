@@ -117,10 +117,9 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
 
 def _options(effort: Effort, kind: str, scale: float = 1.0) -> tuple[str, ...]:
     """Return the options of the commands that make and judge the designs of one kind."""
-    element = "hoe" if kind == "hoe" else "lens"
     iterations = effort.hoe_iterations if kind == "hoe" else effort.lens_iterations
     words = [
-        "--size-px", effort.side_px(element, scale), "--distance-um", effort.distance_um(element, scale),
+        "--size-px", effort.side_px(kind, scale), "--distance-um", effort.distance_um(kind, scale),
         "--iterations", iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
     ]  # fmt: skip
     if kind == "hoe":
@@ -142,3 +141,19 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
     if unknown := [name for name in wanted if name not in known]:
         raise InputError("tasks", got=", ".join(unknown), wanted=f"some of {', '.join(known)}")
     return [task for task in every if task.name in wanted]
+
+
+def require_whole_parts(every: Sequence[Task], todo: Sequence[Task]) -> None:
+    """Check that the tasks at full size of each part are all there or none. Only whole parts are published.
+
+    Raises:
+        InputError: a task at full size is missing.
+    """
+    parts = {task.part for task in todo}
+    whole = [task for task in every if task.part in parts and not task.name.endswith(REDUCED)]
+    if missing := [task.name for task in whole if task not in todo]:
+        raise InputError(
+            "--publish",
+            got=f"--tasks without {', '.join(missing)}",
+            wanted="these tasks, too, because the page shows them together",
+        )

@@ -10,12 +10,13 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from benchmarks.gap.__main__ import main
 from benchmarks.gap.document import PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
 from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
 from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
-from benchmarks.gap.tasks import FAB, KINDS, MEASURED, REDUCED, Task, chosen, tasks
+from benchmarks.gap.tasks import FAB, KINDS, MEASURED, REDUCED, Task, chosen, require_whole_parts, tasks
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import Workers
@@ -132,6 +133,19 @@ def test_a_reduced_task_has_the_same_geometry_and_more_seeds(tmp_path):
             word for word in full if word.startswith("--")
         ]
         assert by_name[f"{name}{REDUCED}"].seeds == 10
+
+
+def test_a_page_with_some_of_the_tasks_is_not_published(tmp_path, monkeypatch, capsys):
+    options = ["--out", str(tmp_path / "gap"), "--tasks", "hoe", "--publish"]
+    monkeypatch.setattr(sys, "argv", ["gap", *options])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert "--publish" in capsys.readouterr().err
+    assert not (tmp_path / "gap").exists()
+    every = tasks(tmp_path, TINY, {}, None)
+    for whole in ("hoe,lens-direct,lens-computational", "hoe-measured", None):
+        require_whole_parts(every, chosen(every, whole))
 
 
 def test_the_tables_name_the_winner_and_what_is_undecided():
