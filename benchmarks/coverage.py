@@ -36,7 +36,9 @@ TARGETS = ("ring", "text", "letters", "spots", "chart")
 DESIGNED_BY = "zoo:physics"
 PRINTED_BY = ("zoo:pbl", "zoo:random-features", "zoo:blur-table", "zoo:affine-mtf", "zoo:features")
 SETTINGS = {"layout.size_px": 128, "optics.distance_um": 25, "search.iterations": 60, "window.yield_draws": 2}
-KINDS = ("photograph", "scan", "scan without substrate")
+# Pixels of substrate around the print in each kind of scan.
+MARGINS_PX = {"scan": 16, "scan without substrate": 3}
+KINDS = ("photograph", *MARGINS_PX)
 _FINER = 4
 
 
@@ -169,7 +171,7 @@ def measure(
             source = photograph(loaded, height, rng, folder / "photo.png")
             found = judge_design(loaded, [], camera=source).scores[0]
         else:
-            scanned = scan(loaded, height, rng, folder / "scan.txt", 16 if kind == "scan" else 3)
+            scanned = scan(loaded, height, rng, folder / "scan.txt", MARGINS_PX[kind])
             found = judge_design(loaded, [], scan=scanned).scores[0]
     except InputError as error:
         return {"kind": kind, "refused": str(error)}

@@ -50,6 +50,7 @@ _ORDERS = (3, 4, 5, 6)
 # factor ``_LARGER``. In addition, all terms of tilt and bow may have one common relative error, whose
 # standard deviation is ``_COMMON_SD``. Both numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
+# Total orders of the polynomials that each kind of levelling removes.
 _FITTED: dict[Levelling, tuple[int, ...]] = {"none": (), "plane": (1,), "bow": (1, 2)}
 # Number of groups into which the pixels are divided by their expected height.
 _HEIGHTS = 32
@@ -357,7 +358,7 @@ def fitted_background(
 
 def substrate_background(placed: _Placed, pitch_um: float, levelling: Levelling) -> Background | None:
     """Fit the tilt and bow of a scan to the bare substrate around the print, without pixels that deviate.
-    Return None if the scan does not show enough of it, or if it is not flat.
+    Return None if too little of the substrate was measured, or if the substrate is not flat.
     """
     margin, foot = placed.margin_px, math.ceil(_FOOT_UM / pitch_um)
     width, shape = margin - foot, placed.inner(placed.valid).shape
@@ -368,13 +369,13 @@ def substrate_background(placed: _Placed, pitch_um: float, levelling: Levelling)
     sides = bare[:width], bare[-width:], bare[:, :width], bare[:, -width:]
     if min(side.mean() for side in sides) < _BARE_SHARE:
         return None
-    columns = np.dstack([_shapes(shape, (0, *_FITTED[levelling]), margin)])
+    columns = _shapes(shape, (0, *_FITTED[levelling]), margin)
     for _ in range(3):
         seen, height = columns[bare], placed.height_um[bare].astype(float)
         found, *_ = np.linalg.lstsq(seen, height, rcond=None)
         rest = np.abs(height - seen @ found)
         spread_um = 1.4826 * float(np.median(rest))
-        bare[bare] = rest < 4 * spread_um
+        bare[bare] = rest <= 4 * spread_um
     if spread_um > _FLAT_UM or min(side.mean() for side in sides) < _BARE_SHARE:
         return None
     variances = np.diag(np.linalg.inv(seen.T @ seen))[1:] * _ALIKE_PX

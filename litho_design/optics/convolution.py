@@ -1,8 +1,8 @@
 """Convolve by FFT. Rows that are cropped afterwards are not transformed, neither in the convolution nor in
 its gradient.
 
-On a CPU, columns are transformed a block at a time. The values of a block stay in the cache of the processor
-from the transform to its inverse, which takes less than half the time of whole transforms.
+On a CPU, columns are transformed a block at a time, so that the values of a block stay in the cache of the
+processor from the transform to its inverse. For fields of 1024 px, this halves the time.
 """
 
 from __future__ import annotations

@@ -485,6 +485,13 @@ def test_the_standard_deviations_of_the_substrate_fit_hold():
     assert 0.6 < np.sqrt(np.mean(seen_um**2) / np.mean(stated_um**2)) < 1.3
 
 
+def test_a_substrate_without_noise_is_used():
+    exact = _Placed(np.pad(np.full((64, 96), 0.4), 12), np.ones((88, 120), bool), 12)
+    found = substrate_background(exact, 0.1, "bow")
+    assert found is not None
+    assert not found.map_um.any()
+
+
 def test_a_substrate_that_is_hidden_or_not_flat_is_not_used():
     flat = np.full((64, 96), 0.4)
     assert substrate_background(on_substrate(flat), 0.1, "none") is None
