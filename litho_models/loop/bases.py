@@ -22,7 +22,7 @@ from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
 from litho_models.loop.fits import Study
-from litho_models.loop.model import FoldedBase
+from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.prepared import exposed
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
@@ -40,6 +40,7 @@ def bases_for(
     steps: int | None = None,
     cache: Path,
     fields: Mapping[str, Any] = {},
+    nested: bool = False,
 ) -> dict[str, nn.Module]:
     """Return the base models that the loop may correct, keyed by name. If the base is a network, it is
     trained once for each fold, without the scans of this fold.
@@ -52,10 +53,12 @@ def bases_for(
             the network is used.
         cache: folder in which trained networks are kept.
         fields: settings of a small model, keyed by name, such as ``{"spot.sigma_um": 0.3}``.
+        nested: whether all choices will be repeated without some of the scans. This needs a base that is
+            refitted.
 
     Raises:
-        InputError: the base is unknown, its pitch differs from that of the scans, or settings are given for a
-            base that is not a small model.
+        InputError: the base is unknown, its pitch differs from that of the scans, settings are given for a
+            base that is not a small model, or ``nested`` is set for a base that is not refitted.
     """
     scans = study.stored
     named = _built(base, scans[0], fields) if base in MODELS else None
@@ -65,10 +68,14 @@ def bases_for(
         )
     if base == AUTO:
         return {name: _built(name, scans[0]) for name in _COMPETING}
-    if named is None:
-        return _frozen(base, scans[0].pitch_um)
-    if is_small(named):
-        return {base: named}
+    name, model = _frozen(base, scans[0].pitch_um) if named is None else (base, named)
+    # This is checked before a network is trained, which takes long.
+    if nested and not is_refitted(model):
+        raise InputError(
+            f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
+        )
+    if named is None or is_small(model):
+        return {name: model}
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     recipe = TrainingConfig.of_recipe("fast", base, film=study.of_films, seed=study.seed, **given)
     return {base: train_folds(study, partial(fit_in_cache, base, config=recipe, cache=cache))}
@@ -79,13 +86,13 @@ def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simu
     return build_model(name, **common_geometry([scan]), **{**usual, **fields})
 
 
-def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
+def _frozen(base: str, pitch_um: float) -> tuple[str, Simulator]:
     folder = zoo.model_folder(base, other=[AUTO, *MODELS])
     card = ModelCard.read(folder)
     if abs(card.pitch_um - pitch_um) > 1e-9:
         wanted = f"{pitch_um:g} µm, the pitch of the scans"
         raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=wanted)
-    return {card.name: load_simulator(folder, card)}
+    return card.name, load_simulator(folder, card)
 
 
 def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]) -> FoldedBase:

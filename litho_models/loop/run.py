@@ -122,12 +122,10 @@ def close_loop(
     ):
         study = replace(study, workers=places)
         kept = Path(cache or f"{out}-cache")
-        bases = bases_for(base, study, steps=steps, cache=kept, fields=base_settings)
+        bases = bases_for(
+            base, study, steps=steps, cache=kept, fields=base_settings, nested=nested is not None
+        )
         refitted = all(map(is_refitted, bases.values()))
-        if nested and not refitted:
-            raise InputError(
-                f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
-            )
         if not refitted and base not in MODELS and trained_ids(load_frozen(base), opened):
             raise InputError(
                 f"base {base}",

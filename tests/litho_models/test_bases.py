@@ -24,6 +24,7 @@ from litho_models.fitting import Fitted
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.freezing import freeze
+from litho_models.loop import bases
 from litho_models.loop.bases import bases_for, train_folds
 from litho_models.loop.closing import close
 from litho_models.loop.errors import HeldOut
@@ -193,6 +194,15 @@ def test_a_frozen_network_is_no_base_for_the_scans_it_was_trained_on(tmp_path: P
         close_loop(store, tmp_path / "out", base=str(tmp_path / "model"))
     assert not (tmp_path / "out").exists()
     close_loop(other, tmp_path / "out", base=str(tmp_path / "model"))
+
+
+def test_a_network_is_refused_for_nested_choices_before_it_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bases, "train_folds", None)
+    store = write_store(tmp_path / "s.zarr", make_scans(6, size_px=56))
+    with pytest.raises(InputError, match="--nested with features"):
+        close_loop(store, tmp_path / "out", base="features", nested="prints")
 
 
 def test_prints_are_left_out_only_if_there_are_two(tmp_path: Path) -> None:
