@@ -33,7 +33,7 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     matrix C to the matrix of second moments of the spot. The parameters of the effect are Cxx - Cyy and
     2 Cxy.
 
-    Source: Gaussian spot of the paper, with a full second-moment matrix.
+    The spot of the paper is a round Gaussian; here, it has a full second-moment matrix.
     """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
@@ -56,7 +56,7 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Add the dose that leaks in from the neighbourhood of each pixel; see ``add_scattered``.
 
-    Source: proximity sum of two Gaussians, as in electron-beam writing; weights may be negative.
+    In electron-beam writing, the proximity function is a sum of two Gaussians. Here, weights may be negative.
     """
     return add_scattered(layout, values["weight"], values["length_um"], context.pitch_um)
 
@@ -70,7 +70,7 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
     """Raise the dose to a power: D = M_ref (M / M_ref)^p, where M_ref is the full height. Before the power is
     taken, 1 % of M_ref is added to M, so that the slope at M = 0 stays finite.
 
-    Source: Schwarzschild exponent of the dose.
+    The exponent is that of Schwarzschild's law.
     """
     foot = 0.01
     exponent, full = values["exponent"], context.full_height_um
@@ -97,7 +97,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
     spot is lost, and a gap that is narrower than the spot is filled.
 
-    Source: slices of 0.1 µm, as in the paper, with a threshold applied to each slice.
+    The slices of the paper are 0.1 µm high. A threshold is applied to each slice.
     """
     # ``project`` uses a hyperbolic tangent. With half the steepness, it has the shape of a logistic function.
     exposed = context.exposed_slices

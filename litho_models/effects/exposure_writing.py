@@ -28,7 +28,7 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Reduce the dose towards the edge of the write field: D = M (1 - v r² / R²), where r is the distance
     from the centre of the write field and R is half the width of the write field.
 
-    Source: aperture of scanning objectives; quadratic in the field radius.
+    The aperture of the objective cuts off light, in proportion to the squared distance from the axis.
     """
     y, x = context.centred_um()
     return layout * (1 - values["strength"] * (y * y + x * x) / context.radius_um() ** 2)
@@ -65,7 +65,7 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
     """Let the dose drift from field to field: D = M (1 + ρ t), where ρ is the relative drift over all fields
     and t is the position of the field in the writing order, from -0.5 to 0.5.
 
-    Source: linear in the writing order.
+    The drift is linear in the writing order.
     """
     return layout * (1 + values["drift"] * context.order)
 
@@ -89,7 +89,7 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     is the depth at which writing started, measured from the surface of the substrate, and u is the mean
     nominal height nearby as a fraction of the full height.
 
-    Source: the printer searches for the interface before writing; heights are clipped at the substrate.
+    The printer searches for the interface before writing. Heights are clipped at the substrate.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - context.dose_nearby(values["length_um"]))
@@ -110,7 +110,7 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     one-sided exponential of length l = v τ (speed times time constant). The mean delay l of this filter is
     removed, because registration removes every mean shift.
 
-    Source: first-order lag of the deflection, l = speed x time constant.
+    The deflection has a first-order lag: l is the speed times the time constant.
     """
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
@@ -133,7 +133,7 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
     At an edge, the formula removes the correct area, but gives the edge a wrong profile. This error does not
     matter, because the spot is wider than δ and determines the profile of the edge.
 
-    Source: shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm.
+    The length is the delay of the shutter times the writing speed, such as 5 µs x 40 mm/s = 0.2 µm.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -151,7 +151,7 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     If x is measured from the edge of the write field instead, the full displacement is c x (1 - x / 2R). The
     formula above leaves out the part of this displacement that registration removes.
 
-    Source: distortion of the write field by a galvo or a stage, quadratic along the line.
+    A galvo or a stage distorts the write field, by a quadratic function of the position along the line.
     """
     fast = 1 if context.slow_axis == "y" else 0
     half_um = context.whole_shape()[fast] * context.pitch_um / 2
@@ -175,7 +175,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0). Here e is the strength of the
     depletion, and the kernel K_l is a one-sided exponential of length l along the slow axis.
 
-    Source: oxygen and radical depletion along the slow writing axis, y unless the card says x.
+    Oxygen and radicals are depleted along the slow writing axis, which is y unless the card says x.
     """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
     pitch = context.pitch_um
@@ -208,7 +208,7 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     The frequency f is the alias frequency |1/p - 1/dx|, where dx is the pixel size. The ripples have a fixed
     phase in the write field, so they are the same in every print.
 
-    Source: ripples in the noise figure of the paper, at a pitch of 0.1 µm.
+    The noise figure of the paper shows such ripples, at a pitch of 0.1 µm.
     """
     across_um = context.centred_um()["yx".index(context.slow_axis)]
     phase = 2 * math.pi * values["frequency_per_um"] * across_um

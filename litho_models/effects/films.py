@@ -48,7 +48,7 @@ _of_films = partial(entry, role="process", of_films=True)
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Add the dose that the substrate scatters back into the film; see ``add_scattered``.
 
-    Source: second Gaussian of the proximity function: Chang, J. Vac. Sci. Technol. 12, 1271 (1975).
+    This is the second Gaussian of the proximity function (Chang, J. Vac. Sci. Technol. 12, 1271, 1975).
     """
     return add_scattered(layout, values["weight"], values["length_px"], 1.0)
 
@@ -64,7 +64,7 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     """Blur the film by a Gaussian of variance s², and place the new edge where the blurred film is
     one half.
 
-    Source: acid or reactants diffuse in a resist of high contrast, which has a threshold at one half.
+    Acid or reactants diffuse in a resist of high contrast, whose threshold is one half.
     """
     full = context.full_height_um
 
@@ -88,7 +88,7 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Move edges outwards by the bias.
 
-    Source: lateral etching at a constant rate, the same at every dose and in every surrounding.
+    Lateral etching has a constant rate, which depends neither on the dose nor on the surroundings.
     """
     return _moved(height, values["bias_px"], context)
 

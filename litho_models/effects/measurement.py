@@ -41,7 +41,7 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     follows falling edges more slowly than rising edges, because it loses contact there (parachuting). The
     time constant of the lag is fixed, so l is shorter if the pixels are smaller.
 
-    Source: first-order feedback loop; a probe that parachutes loses the surface on the way down.
+    The feedback loop is of first order. A probe that parachutes loses the surface on its way down.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -70,7 +70,7 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     The full displacement is c x (1 - x / L), where x is measured from the start of the line. The formula
     leaves out the part of this displacement that registration removes.
 
-    Source: hysteresis of a piezo scanner, quadratic along the line.
+    The hysteresis of a piezo scanner is quadratic along the line.
     """
     _, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
@@ -87,7 +87,7 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
 
     The width of the blur is a fixed number of pixels, so smaller pixels give less blur.
 
-    Source: kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes have slower filters.
+    At 0.1 µm per pixel, interpolation kernels are 0.03 to 0.06 µm wide. Some microscopes filter more.
     """
     variance_um2 = values["variance_um2"] * context.pixel_size**2
     return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
@@ -118,7 +118,7 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
     A tip may be sharper along or across the scan lines. Its radii in these directions are ``along`` × R and
     ``across`` × R.
 
-    Source: dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis.
+    A worn tip is far blunter than a new one, often along one axis.
     """
     radius = values["radius_um"]
     # The formula divides by the radius. For tips sharper than ``_SHARPEST_UM``, the formula is therefore

@@ -20,7 +20,7 @@ _of_microscope = partial(
 _STEP = "scan a step standard and a bare substrate before and after the print"
 
 EFFECTS = (
-    # Source: arXiv:2309.17343: line-like noise along the hatching, too random for any model to predict.
+    # Noise along the hatching (arXiv:2309.17343), which is too random for any model to predict.
     Effect(
         "line-roughness",
         "height of each written line",
@@ -31,7 +31,7 @@ EFFECTS = (
         apply=of_single_scans,
         separating="scan the same field at 0 and 90 degrees",
     ),
-    # Error of the lateral map from scan to layout, affine and quadratic.
+    # The registration maps a scan onto its layout with affine and quadratic errors.
     _of_microscope(
         "registration-residual",
         "shift and distortion left by the registration",
@@ -44,21 +44,21 @@ EFFECTS = (
         },
         separating="alignment marks in every field",
     ),
-    # Calibration of the z-scanner.
+    # The z-scanner is calibrated only roughly.
     _of_microscope(
         "z-gain",
         "height calibration of each scan",
         parameters={"gain": Parameter("1", -0.2, 0.2, 0.02)},
         separating=_STEP,
     ),
-    # Levelling without a reference surface.
+    # A scan without a reference surface has no known zero.
     _of_microscope(
         "datum-offset",
         "zero height of each scan",
         parameters={"offset_um": Parameter("µm", -0.5, 0.5, 0.03)},
         separating="leave bare substrate in every field",
     ),
-    # Sample tilt, scanner bow, and errors of polynomial levelling.
+    # The sample is tilted, the scanner bends its scans, and polynomial levelling leaves errors.
     _of_microscope(
         "tilt-bow",
         "tilt and bow of each scan",
@@ -68,14 +68,14 @@ EFFECTS = (
         },
         separating=_STEP,
     ),
-    # Drift and feedback noise between the lines of a raster scan.
+    # The height drifts from one line of a raster scan to the next, and the feedback adds noise.
     _of_microscope(
         "scan-line-stripes",
         "height offset of every scan line",
         parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
         separating="scan the same field at 0 and 90 degrees",
     ),
-    # Exponential creep of the scanner; the bow contains the slow part of the creep.
+    # The scanner creeps exponentially. The slow part of the creep looks like a bow.
     _of_microscope(
         "slow-drift",
         "creep after the scan starts",

@@ -72,7 +72,7 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
     """Reduce the height of tall structures, whose height is less than proportional to the dose: H / (1 + q
     |H|).
 
-    Source: first-order saturation of the printed height.
+    The printed height saturates to first order.
     """
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
@@ -102,7 +102,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     """Shrink the print more where its surroundings are thin: H (1 - k (1 - u)), where u is the mean nominal
     height nearby as a fraction of the full height.
 
-    Source: Lang 2022, arXiv:2205.14891: shrinkage falls with dose.
+    Source: Lang 2022, arXiv:2205.14891, where shrinkage falls with dose.
     """
     return height * (1 - values["fraction"] * (1 - context.dose_nearby(values["length_um"])))
 
@@ -121,7 +121,7 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     point r = x / (1 + s H_mean / H_full) of the print therefore appears at position x, where H_mean is the
     mean height.
 
-    Source: the print is bound to the substrate at its base but free at its top.
+    The print is bound to the substrate at its base, but its top is free.
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -143,7 +143,7 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
     """Lower features narrower than w by a fraction φ of their height above the surroundings:
     H - φ (H - open_w(H)), where open_w is the morphological opening by a square of side w.
 
-    Source: capillary force while drying; opening of the surface by a square of width w.
+    Capillary forces bend such features while the print dries.
     """
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
@@ -156,8 +156,6 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H), where close_w is the
     morphological closing by a square of side w. The tops are unchanged.
-
-    Source: closing of the surface by a square of width w.
     """
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
 
@@ -222,7 +220,7 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     If cx = cy = c, the loss is c |grad H|^p, regardless of the direction of the slope. If in addition p = 1,
     each edge moves inwards by about c.
 
-    Source: empirical: the loss is a power of the slope, with an ellipse of coefficients in rotated axes.
+    The formula is empirical: the coefficients form an ellipse in rotated axes.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)

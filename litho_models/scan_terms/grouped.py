@@ -226,7 +226,7 @@ class Products:
         """
         if not blocks:
             return []
-        # Scans with the same labels in the groupings of all blocks have the same unknowns.
+        # Scans with the same label in every grouping share all unknowns, so their products are added up.
         alike: dict[Labels, list[int]] = {}
         for scan in scans:
             alike.setdefault(tuple(self.groups[block.by][scan] for block in blocks), []).append(scan)
