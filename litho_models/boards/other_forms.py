@@ -206,7 +206,7 @@ def _alternate_slices(rng: Rng) -> Law:
     return law
 
 
-@_form("focus-step", "dose", "µm", 2.0)
+@_form("focus-step", "dose", "µm", 2.0, names=("defocus",))
 def _focus_step(rng: Rng) -> Law:
     """Blur (standard deviation) added to the spot in prints after a random point near the middle of the
     printing order.

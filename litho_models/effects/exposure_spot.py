@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
-from litho_models.effects.filters import add_filtered, add_scattered
+from litho_models.effects.filters import add_blur, add_filtered, add_scattered
 from litho_models.models.parts import project
 
 # If the variances of the spot along its two axes differ by less than about this value, the spot is narrowed
@@ -43,6 +43,16 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
         return torch.expm1(-(math.pi**2) * moment)
 
     return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM)
+
+
+@of_exposure(
+    "writing spot wider",
+    {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.01, tried=(0.01, 0.09))},
+    separating="print step edges of two heights through focus",
+)
+def defocus(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """Blur the layout by an isotropic Gaussian of variance s², as a spot out of focus does."""
+    return add_blur(layout, values["variance_um2"], context.pitch_um, _SPOT_REACH_UM)
 
 
 @of_exposure(

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -42,7 +42,6 @@ _LAST_KNOT = 16
 _KNOTS = [f"level_{knot}_of_{_LAST_KNOT}" for knot in range(_LAST_KNOT + 1)]
 _POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j}
 _TURNED = "print and scan the same layouts rotated by 90 degrees"
-_SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y", 1)}
 
 
 @dataclass(frozen=True)
@@ -105,15 +104,18 @@ class Surface:
         """
         return local_mean(self.h if of is None else of, self.values["length_um"], self.context.pitch_um, 4)
 
-    def trailing(self, *sides: str) -> Tensor:
-        """Return the weighted mean height on one side of each pixel, or on two sides. The weights decay
-        exponentially with distance, with the decay length ``length_um`` of the law.
+    def trailing(self, *signs: int) -> Tensor:
+        """Return the weighted mean height on one side of each pixel along the rotated x axis, or on both
+        sides. The weights decay exponentially with distance, with the decay length ``length_um`` of the law.
+
+        The sign of a side is 1 if the pixels with smaller x influence a pixel, and -1 otherwise.
         """
         length, pitch = self.values["length_um"], self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            ways = [-sign * self.along(axis, fy, fx) for axis, sign in (_SIDES[side] for side in sides)]
-            return torch.stack([trailing_response(way, length, pitch) for way in ways]).mean(dim=0) - 1
+            along = self.along("x", fy, fx)
+            ways = [trailing_response(sign * along, length, pitch) for sign in signs]
+            return torch.stack(ways).mean(dim=0) - 1
 
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * float(length.detach()))
 
@@ -183,7 +185,13 @@ _POSITION = {
 _POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 3.0))}
 _TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
 _REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
-_TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0)), **_TURN}
+_TAIL = {
+    "length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape"),
+    "turn_deg": Parameter("deg", -180.0, 180.0, 0.0, "shape"),
+}
+# Lengths of tails that screening tries, µm, and the angle between two directions that it tries, degrees. The
+# longer the tail, the more exact its direction must be before a fit can find it.
+_TAILS = {0.6: 45, 2.0: 30, 6.0: 15}
 # For laws that depend on the position in the scan, screening tries only one value of the length. This value
 # is close enough to the best one to start a fit.
 _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
@@ -229,9 +237,17 @@ def _jumps(a: str) -> Iterator[Effect]:
     yield _law(f"{name}-y", f"∂h/∂y {formula}", "µm", lambda s: s.slope("y") * s.beyond(a), _POSITION)
 
 
-def _beside(name: str, *sides: str) -> Effect:
-    formula = f"(mean of D {' and '.join(sides)} over the length) - D"
-    return _law(name, formula, "1", lambda s: s.trailing(*sides) - s.h, _TAIL, "layout")
+def _tail(name: str, sides: str, *signs: int) -> Effect:
+    formula = f"(mean of D on {sides} along x over the length) - D"
+    law = _law(name, formula, "1", lambda s: s.trailing(*signs) - s.h, _TAIL, "layout")
+    # A tail on both sides looks the same after half a turn.
+    circle = 360 // len(signs)
+    trials = tuple(
+        {"strength": 0.05, "length_um": length_um, "turn_deg": float(turn_deg)}
+        for length_um, step_deg in _TAILS.items()
+        for turn_deg in range(-circle // 2, circle // 2, step_deg)
+    )
+    return replace(law, trials=trials)
 
 
 _FOUND = [
@@ -255,9 +271,8 @@ _FOUND = [
     *map(_blurred_at, _WORDS),
     *_jumps("x"),
     *_jumps("y"),
-    _beside("dose-along-x", "left", "right"),
-    _beside("dose-along-y", "above", "below"),
-    *(_beside(f"dose-from-{side}", side) for side in _SIDES),
+    _tail("dose-along", "both sides", 1, -1),
+    _tail("dose-from", "one side", 1),
     _law(
         "dose-times-density",
         "D (mean of D within the length / full height)^power",

@@ -100,6 +100,7 @@ _FORWARD_ORDER = (
     exposure_writing.line_shortening,
     exposure_spot.dose_exponent,
     exposure_spot.elliptical_psf,
+    exposure_spot.defocus,
     exposure_writing.galvo_lag,
     exposure_writing.galvo_nonlinearity,
     exposure_writing.vignetting,

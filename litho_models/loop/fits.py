@@ -34,7 +34,7 @@ from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import grouped_folds
 
-RULES = Rules("squares", steps=24, kept_above=0.8)
+RULES = Rules("squares", steps=24, tries=8, kept_above=0.8)
 
 
 def _silent(message: str) -> None:

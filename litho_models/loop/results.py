@@ -16,6 +16,7 @@ from litho_models.effects.effect import Knowledge
 from litho_models.fitting.least_squares import Linearised, eliminated
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES
+from litho_models.loop.joint_fit import SMALLEST_RETAINED
 from litho_models.loop.judging import FAMILY_P, FEWEST_SCANS
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
@@ -31,7 +32,6 @@ from litho_models.loop.record import (
     Strength,
     Verdict,
 )
-from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
 from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator

@@ -24,15 +24,13 @@ from litho_models.effects import Effect
 from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import gram
 from litho_models.loop.fits import State
+from litho_models.loop.joint_fit import SMALLEST_RETAINED, JointFit
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import ALL_FREE, PreparedScan
-from litho_models.scan_terms.grouped import ALL, Block, Products
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import sign_flips
 
-# The scan terms and the changes that the model's own parameters can make are projected out of each column. An
-# effect can be tested only if at least this fraction of the squared norm of its column remains.
-SMALLEST_RETAINED = 1e-5
 # A candidate is fitted if its predicted gain reaches this fraction of the smallest gain that counts. The
 # fraction is below 1 because screening predicts the gain of a fit only to within a factor of three.
 WORTH_FITTING = 0.3
@@ -243,20 +241,19 @@ class Screening:
         secants: Sequence[Secants] | None = None,
     ):
         self.study, self._mse_nm2 = state.study, state.mse_nm2
-        own = len(state.twin.vector)
-        self.trials = trials_of(effects, 1 + own)
+        self._own = len(state.twin.vector)
+        self.trials = trials_of(effects, 1 + self._own)
         secants = secants or [Secants(state.twin, window) for window in self.study.windows]
-        grams, raw = [], np.array(1e-300)
+        grams, raw = [], []
         for left, part, changes in zip(state.held_out_um, state.linear, secants, strict=True):
             stacked = np.column_stack([left, *part.jacobian, *changes.of(self.trials)])
             grams.append(gram(stacked, changes.free_terms) / len(stacked))
-            raw = raw + np.square(stacked).mean(axis=0)
-        self._grams = np.stack(grams)
-        blocks = [Block((1 + i,)) for i in range(own)]
-        self._freed = Products(self._grams, self.study.groups).freed_of(blocks).grams
-        self._beside_base, self._retained = (
-            np.einsum("sii->i", one) / raw for one in (self._grams, self._freed)
-        )
+            raw.append(np.square(stacked).mean(axis=0))
+        self._grams, self._raw = np.stack(grams), np.stack(raw)
+        # The number of the group of each scan, for each grouping.
+        self._numbers = {
+            by: np.unique(labels, return_inverse=True)[1] for by, labels in self.study.groups.items()
+        }
 
     @cached_property
     def candidates(self) -> list[Screened]:
@@ -283,16 +280,21 @@ class Screening:
 
     def screened(self, trial: Trial, by: str) -> Screened:
         """Screen one trial with one grouping of the scans, without the p values."""
-        labels = np.array(self.study.groups[by])
-        fitted = _solved(self._products(trial), _beside(labels))
+        members = _members(self._numbers[by])
+        fit = self._fit(trial, members)
+        fitted = fit.strengths()
+        raw = np.maximum(members @ self._raw[:, trial.columns], 1e-300)
+        alone, beside = (
+            (np.einsum("gii->gi", own) / raw).max() for own in (fit.of_columns, fit.beside_parameters())
+        )
         return Screened(
             trial=trial,
             by=by,
-            gains_nm2=self._gains(labels[None], trial)[0],
-            multiples=dict(zip(labels.tolist(), fitted, strict=True)),
+            gains_nm2=self._gains(self._numbers[by][None], trial)[0],
+            multiples=dict(zip(sorted(set(self.study.groups[by])), fitted, strict=True)),
             allowed=not trial.sets or bool(trial.allowed(fitted)),
-            retained=float(self._retained[trial.columns].max()),
-            beside_base=float(self._beside_base[trial.columns].max()),
+            retained=float(beside),
+            beside_base=float(alone),
         )
 
     def standing(self) -> list[Screened]:
@@ -314,39 +316,58 @@ class Screening:
 
     def cosine(self, a: Screened, b: Screened) -> float:
         """Return the cosine of the angle between the changes that two candidates make to the predictions. The
-        changes in all scans form one vector per candidate.
+        changes in all scans form one vector per candidate. What the model's own parameters can imitate is
+        projected out.
         """
-        # The change that a candidate makes is a weighted sum of columns. ``factors`` contains the weights of
-        # the columns in each scan.
-        factors = np.zeros((2, *self._freed.shape[:2]))
-        for own, one in zip(factors, (a, b), strict=True):
-            own[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
-        inner = np.einsum("asi,sij,bsj->ab", factors, self._freed, factors, optimize=True)
+        # Both changes are weighted sums of columns. ``mixed`` contains the weights of all columns in each
+        # scan, first those of the residual and of the model's own parameters, and then those of the two
+        # changes.
+        mixed = np.zeros((*self._raw.shape, self._own + 3))
+        mixed[:, : self._own + 1, :-2] = np.eye(self._own + 1)
+        for at, one in ((-2, a), (-1, b)):
+            mixed[:, one.trial.columns, at] = [one.multiples[label] for label in self.study.groups[one.by]]
+        summed = np.einsum("smi,smn,snj->ij", mixed, self._grams, mixed, optimize=True)
+        (inner,) = JointFit(summed[None], self._own).beside_parameters()
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def _products(self, trial: Trial) -> np.ndarray:
-        both = np.array([0, *trial.columns])
-        # The amplitudes of an effect in the model differ by group, and parameters that are the same in all
-        # scans cannot explain such a difference. The changes that they can make are not projected out.
-        return (self._freed if trial.sets else self._grams)[:, both[:, None], both]
+        """Return the inner products of the residual, the model's own parameters and the columns of a trial in
+        each scan. If the effect is in the model, its amplitudes are not counted as parameters of the model.
+        """
+        own = [at for at in range(1 + self._own) if at not in trial.columns]
+        at = np.array([*own, *trial.columns])
+        return self._grams[:, at[:, None], at]
+
+    def _fit(self, trial: Trial, members: np.ndarray) -> JointFit:
+        """Return the joint fit of a trial and the model's own parameters to groups of scans. ``members`` is
+        the mask of the scans in each group, of shape (…, groups, scans).
+        """
+        summed = np.tensordot(members, self._products(trial), 1)
+        return JointFit(summed, summed.shape[-1] - 1 - len(trial.columns))
 
     def _gains(self, groupings: np.ndarray, trial: Trial) -> np.ndarray:
         """Return the gain of a trial on each scan, nm², of shape (groupings, scans). The strengths of its
-        columns differ by label, and they are fitted without the fold of the scan. They are reduced so that
-        the amplitudes stay within their ranges. If a strength is not allowed, its gain is 0.
+        columns differ by group. They are fitted together with the model's own parameters, without the fold of
+        the scan, and reduced so that the amplitudes stay within their ranges. A strength that is not allowed
+        is set to 0.
 
         Args:
-            groupings: the label of each scan in one or more groupings, of shape (groupings, scans).
+            groupings: the number of each scan's group in one or more groupings, of shape (groupings, scans).
             trial: the trial.
         """
-        products = self._products(trial)
-        # The strengths for a scan are fitted to the scans with the same label in other folds. If there are no
-        # such scans, the scan gains nothing.
-        found = _solved(products, _beside(groupings) & ~_beside(self.study.fold_of))
+        fold_of = self.study.fold_of
+        outside = np.arange(fold_of.max() + 1)[:, None] != fold_of
+        fit = self._fit(trial, _members(groupings)[:, None] & outside[:, None])
+        found = fit.strengths()
         if trial.sets:
             found *= (trial.allowed(found, -1) * trial.reach(found))[..., None]
-        gains = found * (2 * products[:, 0, 1:] - np.einsum("sij,gsj->gsi", products[:, 1:, 1:], found))
-        return gains.sum(axis=-1) * NM_PER_UM**2
+        at = np.arange(len(groupings))[:, None], fold_of, groupings
+        products = self._products(trial)
+        before, after = (
+            np.einsum("gsi,sij,gsj->gs", rest, products, rest, optimize=True)
+            for rest in (fit.rest(0 * found)[at], fit.rest(found)[at])
+        )
+        return (before - after) * NM_PER_UM**2
 
     def best_grouping(self, options: Sequence[Screened]) -> Screened | None:
         """Choose the grouping of the scans for a candidate whose strengths differ between groups. Only
@@ -359,9 +380,9 @@ class Screening:
         Returns:
             The candidate with the chosen grouping and the p value of this grouping. The p value is the
             fraction of random permutations of the scans in which the gain with at least one grouping reaches
-            the gain with the chosen grouping. Permutations that reproduce the chosen grouping are not
-            counted. The result is None if no grouping has a gain, or if the gain of the chosen grouping is
-            not significant.
+            the gain with the chosen grouping. Permutations that reproduce the chosen grouping, or divide its
+            groups further, are not counted. The result is None if no grouping has a gain, or if the gain of
+            the chosen grouping is not significant.
         """
         most = max((one.gain_nm2 for one in options), default=0.0)
         close = [one for one in options if one.gain_nm2 >= 0.95 * most > 0]
@@ -369,12 +390,12 @@ class Screening:
             return None
         best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
         # The first grouping is ``all``.
-        groupings = np.array([*self.study.groups.values()][1:])
-        rng, judged = np.random.default_rng(self.study.seed), _beside(np.array(self.study.groups[best.by]))
+        groupings = np.array([*self._numbers.values()][1:])
+        rng, judged = np.random.default_rng(self.study.seed), _alike(self._numbers[best.by])
         exchanged = beaten = 1
         for _ in range(PERMUTATIONS):
             moved = groupings[:, rng.permutation(len(self.study.scans))]
-            if not (_beside(moved) == judged).all(axis=(1, 2)).any():
+            if not (_alike(moved) <= judged).all(axis=(1, 2)).any():
                 exchanged += 1
                 gained = self._gains(moved, best.trial).mean(axis=1).max()
                 beaten += int(gained >= best.gain_nm2 * (1 - 1e-12))
@@ -384,20 +405,11 @@ class Screening:
         return replace(best, group_p=p) if p <= EXCHANGED_P else None
 
 
-def _beside(labels: np.ndarray) -> np.ndarray:
-    """Return a mask of the pairs of scans that share a label, of shape (…, scans, scans)."""
-    return labels[..., :, None] == labels[..., None, :]
+def _alike(numbers: np.ndarray) -> np.ndarray:
+    """Return the mask of the pairs of scans in the same group, of shape (…, scans, scans)."""
+    return numbers[..., :, None] == numbers[..., None, :]
 
 
-def _solved(products: np.ndarray, fitted_to: np.ndarray) -> np.ndarray:
-    """Fit strengths for each scan to other scans, and return them, of shape (…, scans, columns).
-
-    Args:
-        products: inner products of the residual and the columns in each scan, of shape (scans, 1 + columns, 1
-            + columns).
-        fitted_to: for each scan, the mask of the scans to which its strengths are fitted, of shape (…, scans,
-            scans).
-    """
-    summed = np.tensordot(fitted_to, products, 1)
-    inverse = np.linalg.pinv(summed[..., 1:, 1:], rcond=1e-8, hermitian=True)
-    return (inverse @ summed[..., 1:, :1])[..., 0]
+def _members(numbers: np.ndarray) -> np.ndarray:
+    """Return the mask of the scans in each group, of shape (…, groups, scans)."""
+    return numbers[..., None, :] == np.arange(numbers.max() + 1)[:, None]

@@ -156,74 +156,6 @@ class Products:
 
         Labels that do not occur among these scans are absent from the dictionaries.
         """
-        solved = self._solved(blocks, scans, [0])
-        return [{label: own[:, 0] for label, own in known.items()} for known in solved]
-
-    def squares(
-        self, blocks: Sequence[Block], strengths: Sequence[Strengths], scans: np.ndarray
-    ) -> np.ndarray:
-        """Return the mean squared residual of each scan with the given indices, after the columns of the
-        blocks have been subtracted. Before the subtraction, each column is multiplied by its strength in the
-        group to which the scan belongs. The result has shape (scans,).
-
-        If a block has no strengths for the label of a scan, the block is not subtracted from this scan.
-        """
-        residual = np.eye(1, self.grams.shape[1])[0]
-        rests = (self._rest(residual, blocks, strengths, scan) for scan in scans)
-        return np.array([rest @ self.grams[scan] @ rest for rest, scan in zip(rests, scans, strict=True)])
-
-    def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Return the cross-validated mean squared residual of each scan. For each scan, the strengths are
-        fitted to the scans in the other folds. The result has shape (scans,).
-
-        Args:
-            fold_of: number of the fold of each scan, of shape (scans,).
-        """
-        left = np.empty(len(fold_of))
-        for fold in np.unique(fold_of):
-            own = np.flatnonzero(fold_of == fold)
-            fitted = self.strengths(blocks, np.flatnonzero(fold_of != fold))
-            left[own] = self.squares(blocks, fitted, own)
-        return left
-
-    def freed_of(self, blocks: Sequence[Block]) -> Products:
-        """Fit the columns of the given blocks to the residual and to every other column, in all scans.
-        Subtract these fits, and return the products of what remains.
-
-        The columns of the blocks become zero. If the strengths of other columns are the same in all scans, a
-        later fit of these columns gives the same result as a joint fit with the blocks. If these strengths
-        differ by group, the two results agree only if the subtracted part is the same in all groups.
-        """
-        whole = np.eye(self.grams.shape[1])
-        solved = self._solved(blocks, np.arange(len(self.grams)), range(len(whole)))
-        freed = np.empty_like(self.grams)
-        for scan in range(len(freed)):
-            rest = self._rest(whole, blocks, solved, scan)
-            rest[:, [column for block in blocks for column in block.columns]] = 0
-            freed[scan] = rest.T @ self.grams[scan] @ rest
-        return Products(freed, self.groups)
-
-    def _rest(
-        self, start: np.ndarray, blocks: Sequence[Block], strengths: Sequence[Strengths], scan: int
-    ) -> np.ndarray:
-        """Subtract the columns of the blocks, times their strengths in one scan, from a combination of the
-        residual and the columns. The combination ``start`` and the result have shape (1 + m,), or (1 + m,
-        targets) for several combinations.
-        """
-        rest = start.copy()
-        for block, known in zip(blocks, strengths, strict=True):
-            own = known.get(self.groups[block.by][scan])
-            if own is not None:
-                rest[list(block.columns)] -= own
-        return rest
-
-    def _solved(self, blocks: Sequence[Block], scans: np.ndarray, targets: Sequence[int]) -> list[Strengths]:
-        """Solve the normal equations, and return the strengths that fit each target best in the sense of
-        least squares, in the form of ``strengths``. A target is the index of a column, or 0 for the residual.
-        Each array of strengths has shape (columns, targets).
-
-        There is one unknown, and therefore one row, for every combination of a column and a label.
-        """
         if not blocks:
             return []
         # Scans with the same label in every grouping share all unknowns, so their products are added up.
@@ -238,14 +170,48 @@ class Products:
                 own[label] = len(shrunk) + np.arange(len(block.columns))
                 shrunk += [block.shrinking * usual[column] for column in block.columns]
         columns = [column for block in blocks for column in block.columns]
-        matrix, right = np.diag(shrunk), np.zeros((len(shrunk), len(targets)))
+        matrix, right = np.diag(shrunk), np.zeros(len(shrunk))
         for labels, members in alike.items():
             at = np.concatenate([own[label] for own, label in zip(rows, labels, strict=True)])
             # To take rows and then columns is several times as fast as ``np.ix_``.
             gram = self.grams[members].sum(axis=0).take(columns, axis=0)
             matrix[np.ix_(at, at)] += gram.take(columns, axis=1)
-            right[at] += gram.take(targets, axis=1)
-        scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
-        normal = matrix / (scale * scale.T) + _ALIKE * np.eye(len(scale))
+            right[at] += gram[:, 0]
+        scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        normal = matrix / np.outer(scale, scale) + _ALIKE * np.eye(len(scale))
         solved = np.linalg.solve(normal, right / scale) / scale
         return [{label: solved[at] for label, at in own.items()} for own in rows]
+
+    def squares(
+        self, blocks: Sequence[Block], strengths: Sequence[Strengths], scans: np.ndarray
+    ) -> np.ndarray:
+        """Return the mean squared residual of each scan with the given indices, after the columns of the
+        blocks have been subtracted. Before the subtraction, each column is multiplied by its strength in the
+        group to which the scan belongs. The result has shape (scans,).
+
+        If a block has no strengths for the label of a scan, the block is not subtracted from this scan.
+        """
+        residual = np.eye(1, self.grams.shape[1])[0]
+        left = np.empty(len(scans))
+        for at, scan in enumerate(scans):
+            rest = residual.copy()
+            for block, known in zip(blocks, strengths, strict=True):
+                own = known.get(self.groups[block.by][scan])
+                if own is not None:
+                    rest[list(block.columns)] -= own
+            left[at] = rest @ self.grams[scan] @ rest
+        return left
+
+    def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
+        """Return the cross-validated mean squared residual of each scan. For each scan, the strengths are
+        fitted to the scans in the other folds. The result has shape (scans,).
+
+        Args:
+            fold_of: number of the fold of each scan, of shape (scans,).
+        """
+        left = np.empty(len(fold_of))
+        for fold in np.unique(fold_of):
+            own = np.flatnonzero(fold_of == fold)
+            fitted = self.strengths(blocks, np.flatnonzero(fold_of != fold))
+            left[own] = self.squares(blocks, fitted, own)
+        return left

@@ -81,6 +81,7 @@ FORMULAS: dict[str, tuple[dict[str, float], Callable[..., Field]]] = {
         lambda radius_um, **shape: M + radius_um * (SLOPE_X**2 + SLOPE_Y**2) / 2,
     ),
     # A plane is not changed by effects that blur, fill narrow structures, or lag relative to a mean delay.
+    "defocus": ({"variance_um2": 0.04}, lambda **values: M),
     "diffusion-blur": ({"variance_um2": 0.04}, lambda **values: M),
     "resampling-blur": ({"variance_um2": 0.04}, lambda **values: M),
     "long-range-proximity": ({"weight": 0.3, "length_um": 0.3}, lambda **values: M),

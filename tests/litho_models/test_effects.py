@@ -45,7 +45,7 @@ def test_the_catalogue_is_not_empty_and_holds_all_stages_and_roles() -> None:
 
 # The stage and role of each effect follow from how it arises. Designs use only process effects.
 BELONGS_TO = {
-    ("exposure", "process"): """elliptical-psf long-range-proximity dose-exponent galvo-lag
+    ("exposure", "process"): """elliptical-psf defocus long-range-proximity dose-exponent galvo-lag
         galvo-nonlinearity vignetting
         field-curvature layer-stacking interface-offset""",
     ("exposure", "nuisance"): "laser-drift hatch-ripple line-roughness",
@@ -185,10 +185,11 @@ def amplitude_ratio(changed: torch.Tensor, original: torch.Tensor, edge_px: int 
     return float(changed[inner].std() / original[inner].std())
 
 
+@pytest.mark.parametrize("name", ["defocus", "diffusion-blur"])
 @pytest.mark.parametrize("frequency", [0.25, 0.5])
-def test_diffusion_blur_has_the_gaussian_transfer(frequency: float) -> None:
+def test_a_blur_has_the_gaussian_transfer(name: str, frequency: float) -> None:
     wave, context = cosine(frequency, "x")
-    changed = get_effect("diffusion-blur")(wave, {"variance_um2": 0.09}, context)
+    changed = get_effect(name)(wave, {"variance_um2": 0.09}, context)
     expected = math.exp(-2 * math.pi**2 * 0.09 * frequency**2)
     # The edge is 6 µm = 20 sigma away, so the results differ only by rounding.
     assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=1e-9)

@@ -49,14 +49,14 @@ def written_out(maps: np.ndarray, blocks: list[Block], scans: np.ndarray) -> tup
     return np.array(found), names
 
 
-def solved(maps: np.ndarray, blocks: list[Block], scans: np.ndarray, target: int = 0) -> np.ndarray:
+def solved(maps: np.ndarray, blocks: list[Block], scans: np.ndarray) -> np.ndarray:
     """Solve the least-squares problem, to which a penalty row is added for each strength."""
     columns, names = written_out(maps, blocks, scans)
     usual = np.mean(maps[scans] ** 2, axis=(0, 2))
     penalty = [blocks[number].shrinking * usual[column] for number, _, column in names]
     design = columns.reshape(len(names), -1).T / np.sqrt(PIXELS)
     stacked = np.vstack([design, np.diag(np.sqrt(penalty))])
-    aim = np.concatenate([maps[scans, target].reshape(-1) / np.sqrt(PIXELS), np.zeros(len(names))])
+    aim = np.concatenate([maps[scans, 0].reshape(-1) / np.sqrt(PIXELS), np.zeros(len(names))])
     return np.linalg.lstsq(stacked, aim, rcond=1e-10)[0]
 
 
@@ -140,28 +140,3 @@ def test_shrinking_counts_in_scans(shrinking: float) -> None:
     found = products(maps).strengths([Block((1,), "field", shrinking)], EVERY)[0]
     for label, size in sizes.items():
         assert found[label][0] == pytest.approx(size * 4 / (4 + shrinking), rel=1e-6)
-
-
-def test_freed_of_leaves_what_is_orthogonal_to_the_columns() -> None:
-    maps, blocks = rows(), [Block((1,), "field"), Block((2,))]
-    columns, _ = written_out(maps, blocks, EVERY)
-    flat = columns.reshape(len(columns), -1).T
-    freed = maps.copy()
-    for row in (0, 3, 4, 5):
-        fitted = flat @ np.linalg.lstsq(flat, maps[:, row].reshape(-1), rcond=None)[0]
-        freed[:, row] -= fitted.reshape(SCANS, PIXELS)
-        assert np.abs(flat.T @ freed[:, row].reshape(-1)).max() < 1e-9 * SCANS * PIXELS
-    freed[:, [1, 2]] = 0
-    found = products(maps).freed_of(blocks)
-    np.testing.assert_allclose(found.grams, products(freed).grams, **CLOSE)
-    assert found.groups is GROUPS
-
-
-def test_strengths_after_a_projection_equal_those_of_the_whole_fit() -> None:
-    """Check the theorem of Frisch and Waugh for strengths that are shared by all scans."""
-    first, second = [Block((1,), "field"), Block((2,))], [Block((3, 4)), Block((5,))]
-    whole = products(rows()).strengths([*first, *second], EVERY)[len(first) :]
-    freed = products(rows()).freed_of(first).strengths(second, EVERY)
-    for one, other in zip(whole, freed, strict=True):
-        for label in one:
-            np.testing.assert_allclose(other[label], one[label], **CLOSE)
