@@ -191,7 +191,7 @@ _TAIL = {
 }
 # Lengths of tails that screening tries, µm, and the angle between two directions that it tries, degrees. The
 # longer the tail, the more exact its direction must be before a fit can find it.
-_TAILS = {0.6: 45, 2.0: 30, 6.0: 15}
+_TAILS = {0.6: 45, 2.0: 45, 6.0: 20}
 # For laws that depend on the position in the scan, screening tries only one value of the length. This value
 # is close enough to the best one to start a fit.
 _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}

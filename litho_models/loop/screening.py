@@ -250,16 +250,16 @@ class Screening:
             grams.append(gram(stacked, changes.free_terms) / len(stacked))
             raw.append(np.square(stacked).mean(axis=0))
         self._grams, self._raw = np.stack(grams), np.stack(raw)
-        # The number of the group of each scan, for each grouping.
-        self._numbers = {
-            by: np.unique(labels, return_inverse=True)[1] for by, labels in self.study.groups.items()
-        }
+        # The number of each scan's group in each grouping, of shape (groupings, scans).
+        self._numbers = np.array(
+            [np.unique(labels, return_inverse=True)[1] for labels in self.study.groups.values()]
+        )
 
     @cached_property
     def candidates(self) -> list[Screened]:
         """Return the best trial of each effect for each grouping."""
         best: dict[tuple[str, str], Screened] = {}
-        for one in (self.screened(trial, by) for trial in self.trials for by in self.study.groups):
+        for one in (own for trial in self.trials for own in self.screened(trial).values()):
             other = best.setdefault((one.name, one.by), one)
             if (one.allowed, one.gain_nm2) > (other.allowed, other.gain_nm2):
                 best[one.name, one.by] = one
@@ -278,24 +278,32 @@ class Screening:
         """
         return {one.name: one for one in self.candidates if one.by == ALL}
 
-    def screened(self, trial: Trial, by: str) -> Screened:
-        """Screen one trial with one grouping of the scans, without the p values."""
-        members = _members(self._numbers[by])
+    def screened(self, trial: Trial) -> dict[str, Screened]:
+        """Screen one trial with each grouping of the scans, without the p values. The result is keyed by the
+        name of the grouping.
+        """
+        members = _members(self._numbers)
         fit = self._fit(trial, members)
-        fitted = fit.strengths()
+        strengths, gains_nm2 = fit.strengths(), self._gains(self._numbers, trial)
         raw = np.maximum(members @ self._raw[:, trial.columns], 1e-300)
         alone, beside = (
-            (np.einsum("gii->gi", own) / raw).max() for own in (fit.of_columns, fit.beside_parameters())
+            (np.einsum("...ii->...i", own) / raw).max(axis=(1, 2)).tolist()
+            for own in (fit.of_columns, fit.beside_parameters())
         )
-        return Screened(
-            trial=trial,
-            by=by,
-            gains_nm2=self._gains(self._numbers[by][None], trial)[0],
-            multiples=dict(zip(sorted(set(self.study.groups[by])), fitted, strict=True)),
-            allowed=not trial.sets or bool(trial.allowed(fitted)),
-            retained=float(beside),
-            beside_base=float(alone),
-        )
+        found = {}
+        for at, (by, labels) in enumerate(self.study.groups.items()):
+            names = sorted(set(labels))
+            fitted = strengths[at, : len(names)]
+            found[by] = Screened(
+                trial=trial,
+                by=by,
+                gains_nm2=gains_nm2[at],
+                multiples=dict(zip(names, fitted, strict=True)),
+                allowed=not trial.sets or bool(trial.allowed(fitted)),
+                retained=beside[at],
+                beside_base=alone[at],
+            )
+        return found
 
     def standing(self) -> list[Screened]:
         """Return the significant candidates, in order of decreasing gain. Each candidate has its best
@@ -390,8 +398,9 @@ class Screening:
             return None
         best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
         # The first grouping is ``all``.
-        groupings = np.array([*self._numbers.values()][1:])
-        rng, judged = np.random.default_rng(self.study.seed), _alike(self._numbers[best.by])
+        groupings = self._numbers[1:]
+        judged = _alike(self._numbers[[*self.study.groups].index(best.by)])
+        rng = np.random.default_rng(self.study.seed)
         exchanged = beaten = 1
         for _ in range(PERMUTATIONS):
             moved = groupings[:, rng.permutation(len(self.study.scans))]

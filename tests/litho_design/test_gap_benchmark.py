@@ -185,7 +185,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     record["tasks"]["hoe-reduced"] = {**record["tasks"]["hoe"], "seeds": [*range(10)], "paired": pairs}
     record["summary"] = [*rows, *({**item, "task": "hoe-reduced"} for item in rows)]
     text = as_markdown(record)
-    assert "elements of 0.25 of this size and 10 seeds" in text
+    assert "elements 0.25 times as wide and 10 seeds" in text
     assert "3.000 (2.000 to 4.000) than without a model" in text
     assert "includes 0" not in text
 
