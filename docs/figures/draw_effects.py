@@ -64,11 +64,8 @@ def signature(
         if name in effect.trials[0]:
             wanted = parameter.null + STRENGTH * (parameter.typical - parameter.null)
             trial[name] = min(max(wanted, parameter.lower), parameter.upper)
-    geometry = {"full_height_um": context.full_height_um, "pitch_um": PITCH_UM}
     with torch.no_grad():
-        off, on = (
-            EffectChain(base, effects, **geometry)(layout, context) for effects in ({}, {effect.name: trial})
-        )
+        off, on = (EffectChain(base, effects)(layout, context) for effects in ({}, {effect.name: trial}))
     return (on - off)[0, 0, BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].numpy()
 
 
