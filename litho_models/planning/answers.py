@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
+from litho_data.reports.page import filled
 from litho_models.loop.judging import CONFIRM_P
 from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Question
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
@@ -30,6 +32,8 @@ ENOUGH = 0.95
 # If the power does not exceed this value, the planned prints count as unable to separate the rivals, unless a
 # larger number of prints is enough.
 HOPELESS = 0.2
+# Templates of the reasons for a status and of the possible outcomes, one per line.
+_WHY, _OUTCOMES = (Path(__file__).with_name(f"{name}.jinja") for name in ("why", "outcomes"))
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
@@ -143,33 +147,12 @@ def of_rivals(
     question = rivalry.question
     pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
     hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
-    names = [rival.name for rival in question.rivals]
-    ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
-    why = [
-        "number of standard deviations by which the two most similar rivals (competing explanations) differ "
-        f"on one random print, for each way to scan or print it: {ways}"
-    ]
-    if question.spread:
-        why.append(
-            f"in addition to the noise, the evidence varies between prints by {100 * question.spread:.0f} %"
-        )
-    if question.form_nm is not None:
-        why.append(
-            f"the model's own error is at most {question.form_nm:.1f} nm, and the two rivals differ by "
-            f"{hardest.difference_nm:.1f} nm"
-        )
     return _planned(
         question,
         hardest.power,
         prints,
-        why,
-        [
-            *(f"if {name} fits the scans better than every other rival, it is the cause" for name in names),
-            "if two rivals fit equally well and better than the others, both remain possible, and the others "
-            "are excluded",
-            "if the residuals of all rivals exceed the noise, none of the rivals is the cause",
-        ],
-        rivals=names,
+        tried,
+        rivals=[rival.name for rival in question.rivals],
         pairs=pairs,
         difference_nm=hardest.difference_nm,
         random_difference_nm=min(pair.difference_nm for pair in control),
@@ -219,56 +202,37 @@ def of_others(
         scans: number of scans of each print.
         size_px: side length of a print in pixels.
     """
+    power = [0.0 for _ in COUNTS]
     if question.kind == "lines":
         sd_um = next(iter(question.sizes.values()), 0.0)
-        return _planned(
-            question,
-            [of_lines(sd_um, open_.noise, size_px, n) for n in COUNTS],
-            prints,
-            ["in a rotated scan, scan lines and written lines run along different axes of the layout"],
-            [
-                "if the line offsets follow the layout's rows even in rotated scans, the printer causes them",
-                "if the line offsets follow the scan lines, the microscope causes them",
-            ],
-        )
-    if question.kind == "per-scan":
-        return _planned(
-            question,
-            [of_repeats(n, scans) for n in COUNTS],
-            prints,
-            [
-                "every print is remounted and scanned again, and a term that the printer causes is then the "
-                "same"
-            ],
-            [
-                "if scans of one print agree, the term comes from the printer and differs between prints",
-                "if scans of one print agree no better than scans of different prints, the term comes from "
-                "the microscope",
-            ],
-        )
-    told = [f"when the dataset card states the missing fact, the loop can test {question.name}"]
-    return _planned(question, [0.0 for _ in COUNTS], prints, [question.experiment], told)
+        power = [of_lines(sd_um, open_.noise, size_px, n) for n in COUNTS]
+    elif question.kind == "per-scan":
+        power = [of_repeats(n, scans) for n in COUNTS]
+    return _planned(question, power, prints)
 
 
 def _planned(
-    question: Question, powers: list[float], prints: int, why: list[str], outcomes: list[str], **known: Any
+    question: Question, power: list[float], prints: int, tried: Mapping[str, float] = {}, **known: Any
 ) -> PlannedQuestion:
+    """Make the record of a question with its status, the reason for it, and all possible outcomes. ``known``
+    contains the fields that only questions with rivals have.
+    """
+    needed = next((n for n, own in zip(COUNTS, power, strict=True) if own >= ENOUGH), None)
     status: Status = "may decide"
     if question.kind == "fact":
         status = "needs a fact"
-    elif powers[prints - 1] >= ENOUGH:
+    elif power[prints - 1] >= ENOUGH:
         status = "decides"
-    elif powers[prints - 1] <= HOPELESS and max(powers) < ENOUGH:
+    elif power[prints - 1] <= HOPELESS and not needed:
         status = "no experiment separates"
-        if question.rivals:
-            another = question.experiment
-            why = [*why, f"no experiment of this plan separates them, but another one might: {another}"]
+    facts = {"question": question, "status": status, "tried": tried, **known}
+    why, outcomes = (filled(one, **facts).splitlines() for one in (_WHY, _OUTCOMES))
     return PlannedQuestion(
         **question.model_dump(include={"name", "kind", "text", "form_nm"}),
         status=status,
         why="; ".join(why),
-        power=powers,
-        prints_needed=next((n for n, power in zip(COUNTS, powers, strict=True) if power >= ENOUGH), None),
+        power=power,
+        prints_needed=needed,
         outcomes=outcomes,
-        **{"random_power": powers, **known},
+        **{"random_power": power, **known},
     )

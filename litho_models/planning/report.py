@@ -12,10 +12,9 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
-from litho_data.reports.page import Page, capitalised
+from litho_data.reports.page import Page, capitalised, filled
 from litho_data.reports.pictures import new_figure
 from litho_models.effects import FieldContext
-from litho_models.planning.answers import ENOUGH
 from litho_models.planning.record import NextPrint
 from litho_models.planning.rivalry import Rivalry, predict
 
@@ -60,7 +59,7 @@ def write_report(
         facts={"dataset": plan.dataset.sha256},
         words=Path(__file__).with_name("words.toml"),
     )
-    page.verdict(_verdict(plan))
+    page.verdict(filled(Path(__file__).with_name("verdict.jinja"), plan=plan).strip())
     first = {f"print {at}": level for at, level in enumerate(levels[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
         layouts_figure(first, plan.levels),
@@ -91,19 +90,6 @@ def write_report(
     page.heading("Scans", folded=True)
     page.table(plan.scans, "All scans in the order in which they must be made.", "order.csv")
     return page.write(folder)
-
-
-def _verdict(plan: NextPrint) -> str:
-    facts = " and ".join(q.name for q in plan.questions if q.kind == "fact")
-    asked = [q for q in plan.questions if q.kind != "fact"]
-    decided = "; ".join(q.text for q in asked if q.status == "decides")
-    if not asked:
-        return f"No print is needed: add the missing fact to the card to settle {facts}."
-    wanting = f" No print settles {facts}: add the missing fact to the card." if facts else ""
-    return (
-        f"With a probability of {ENOUGH} or more, these prints decide: {decided or 'nothing'}. "
-        f"Number of open questions: {len(asked)}.{wanting}"
-    )
 
 
 def prints_figure(rivalry: Rivalry, shown: FieldContext) -> Figure:
