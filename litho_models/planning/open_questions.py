@@ -25,7 +25,7 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import RULES
+from litho_models.loop.fits import RULES, Study
 from litho_models.loop.learner import Learner
 from litho_models.loop.model import Twin
 from litho_models.loop.record import ScanFinding
@@ -34,6 +34,7 @@ from litho_models.loop.screening import WORTH_FITTING, Screened
 from litho_models.loop.search import Cause, separating
 from litho_models.planning.questions import (
     Kind,
+    NoiseSpectrum,
     OpenQuestions,
     Owner,
     Question,
@@ -64,36 +65,32 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
         dataset: the dataset on which the loop was closed.
         single_scans: findings of this loop about per-scan terms.
     """
-    asking = _Asking(closed)
-    stored = closed.study.stored
+    study, stored = closed.study, closed.study.stored
+    maps = closed.final.maps_um(study.scans)
+    left = [*map(left_nm, study.scans, maps)]
+    noise = noise_spectrum(left)
+    asked = [_of_cause(closed, cause, left, noise) for cause in closed.traced]
+    asked.append(_of_suspects(closed, maps))
+    for one in single_scans:
+        terms = terms_of_effect(one.name)
+        if one.seen and terms and (one.role == "undetermined" or one.confusable_with):
+            sizes = {parameter: spread.value for parameter, spread in one.spread.items()}
+            asked.append(_question("lines" if line_terms(terms) else "per-scan", [one.name], sizes=sizes))
     write = stored[0].write or {}
     # Effects that could not be tested because a fact about the prints is missing, each with the reason.
     unplaced = "the position of the prints in the write field is not known"
     missing = dict.fromkeys(() if "field_um" in write else _OF_PLACE, unplaced) | closed.untestable
+    asked += [_question("fact", [one], text=why) for one, why in missing.items()]
     return OpenQuestions(
         dataset=dataset,
-        noise=asking.noise,
+        noise=noise,
         level_share=level_share(stored),
         cutoff_per_um=_cutoff_per_um(stored),
         write_field_um=write.get("field_um"),
-        slow_axis=closed.study.scans[0].context.slow_axis,
+        slow_axis=study.scans[0].context.slow_axis,
         surround=write.get("surround"),
         instrument=stored[0].seen_by,
-        questions=[
-            *filter(None, (*map(asking.of_cause, closed.traced), asking.of_suspects())),
-            *(
-                _question(
-                    "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
-                    [one.name],
-                    sizes={parameter: spread.value for parameter, spread in one.spread.items()},
-                )
-                for one in single_scans
-                if one.seen
-                and terms_of_effect(one.name)
-                and (one.role == "undetermined" or one.confusable_with)
-            ),
-            *(_question("fact", [one], text=why) for one, why in missing.items()),
-        ],
+        questions=[*filter(None, asked)],
     )
 
 
@@ -110,110 +107,111 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
     return known.frequency_per_um[int(np.searchsorted(np.cumsum(known.power_share), _POWER_KNOWN))]
 
 
-class _Asking:
-    """Make the open questions of a closed loop whose answers are fitted models (rivals)."""
+def _of_cause(
+    closed: Closed, cause: Cause, left: Sequence[np.ndarray], noise: NoiseSpectrum
+) -> Question | None:
+    """Return the open question about a cause. The question is which effect of a set of similar effects is
+    present, or whether the printer or the microscope causes the effect. Return None if both are already
+    known. ``left`` and ``noise`` are as for ``_spread``.
+    """
+    twin = closed.final.twin.ungrouped()
+    if not cause.alike and len(_owners(cause.name, twin.values()[cause.name])) == 1:
+        return None
+    # If another effect replaces the cause, its fit starts from the values that screening found before any
+    # cause was added to the model.
+    first = {**closed.lawful.first, **closed.named.first}
+    others = cause.alike[: _MOST_MEMBERS - 1]
+    twins = {cause.name: twin} | {one: _with(twin.without(cause.name), first[one]) for one in others}
+    return _question(
+        "set" if others else "role",
+        [*twins],
+        rivals=_rivals(closed.study, twins),
+        spread=_spread(closed, cause.name, left, noise),
+        form_nm=[*closed.rests.values()][-1].most_nm,
+    )
 
-    def __init__(self, closed: Closed):
-        self.closed, self.study = closed, closed.study
-        self.twin = closed.final.twin.ungrouped()
-        self.maps = closed.final.maps_um(closed.study.scans)
-        self.left_nm = [*map(left_nm, self.study.scans, self.maps)]
-        self.noise = noise_spectrum(self.left_nm)
 
-    def of_cause(self, cause: Cause) -> Question | None:
-        """Return the open question about a cause. The question is which effect of a set of similar effects is
-        present, or whether the printer or the microscope causes the effect. Return None if both are already
-        known.
-        """
-        members = [cause.name, *cause.alike][:_MOST_MEMBERS]
-        if len(members) == 1 and len(_owners(cause.name, self.twin.values()[cause.name])) == 1:
-            return None
-        without = self.twin.without(cause.name)
-        # If another effect replaces the cause, its fit starts from the values that screening found before any
-        # cause was added to the model.
-        first = {**self.closed.lawful.first, **self.closed.named.first}
-        twins = {cause.name: self.twin} | {one: _with(without, first[one]) for one in members[1:]}
-        return _question(
-            "set" if cause.alike else "role",
-            members,
-            rivals=self._rivals(twins),
-            spread=self._spread(cause.name),
-            form_nm=[*self.closed.rests.values()][-1].most_nm,
-        )
+def _of_suspects(closed: Closed, maps: Sequence[np.ndarray]) -> Question | None:
+    """Return the question of which unconfirmed effect, if any, explains the residual. An effect is
+    unconfirmed if it is significant in screening, but held-out scans did not confirm it or a later check
+    rejected it. Return None if no effect is unconfirmed. Also return None if only one effect is unconfirmed
+    and the catalogue states whether the printer or the microscope causes it.
 
-    def of_suspects(self) -> Question | None:
-        """Return the question of which unconfirmed effect, if any, explains the residual. An effect is
-        unconfirmed if it is significant in screening, but held-out scans did not confirm it or a later check
-        rejected it. Return None if no effect is unconfirmed. Also return None if only one effect is
-        unconfirmed and the catalogue states whether the printer or the microscope causes it.
-        """
-        named = self.closed.named
-        least = WORTH_FITTING * 0.01 * named.state.mse_nm2
-        unconfirmed = (
-            one
-            for name, one in named.last.items()
-            if name in named.refused and name not in self.twin.names and one.allowed and one.gain_nm2 >= least
-        )
-        standing = sorted(unconfirmed, key=lambda one: -one.gain_nm2)[:_MOST_MEMBERS]
-        names = [one.name for one in standing]
-        if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
-            return None
-        rivals = self._rivals({one.name: _with(self.twin, one) for one in standing})
-        # The loop has estimated the error in the form of the model only for the model without these effects.
-        # Here, this error is estimated for every model with one of the effects, and the smallest estimate is
-        # used.
-        learner = Learner(self.study, self.maps)
-        maps = ([*map(rival.twin(self.twin).height, self.study.scans)] for rival in rivals)
-        form_nm = min(learner.rest(one).most_nm for one in maps)
-        return _question("suspects", names, rivals=rivals, form_nm=form_nm)
+    ``maps`` contains the predicted height of each scan, µm, of shape (ny, nx).
+    """
+    named, twin = closed.named, closed.final.twin.ungrouped()
+    least = WORTH_FITTING * 0.01 * named.state.mse_nm2
+    unconfirmed = (
+        one
+        for name, one in named.last.items()
+        if name in named.refused and name not in twin.names and one.allowed and one.gain_nm2 >= least
+    )
+    standing = sorted(unconfirmed, key=lambda one: -one.gain_nm2)[:_MOST_MEMBERS]
+    twins = {one.name: _with(twin, one) for one in standing}
+    if len(twins) < 2 and not any(get_effect(name).role == "undetermined" for name in twins):
+        return None
+    rivals = _rivals(closed.study, twins)
+    # The loop has estimated the error in the form of the model only for the model without these effects.
+    # Here, this error is estimated for every model with one of the effects, and the smallest estimate is
+    # used.
+    learner = Learner(closed.study, maps)
+    heights = ([*map(rival.twin(twin).height, closed.study.scans)] for rival in rivals)
+    form_nm = min(learner.rest(one).most_nm for one in heights)
+    return _question("suspects", [*twins], rivals=rivals, form_nm=form_nm)
 
-    def _rivals(self, twins: Mapping[str, Twin]) -> list[Rival]:
-        self.study.report(f"fitting the rivals {', '.join(twins)}")
-        windows, units = self.study.windows, independent(self.study.scans)
-        stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
-        rivals = []
-        for member, fit in fit_rivals(twins, windows).items():
-            fitted = twins[member].at(fit.vector)
-            free = fitted.free()[:, None]
-            linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
-            information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
-            effects = fitted.values()
-            rivals += [
-                Rival(
-                    effect=member,
-                    owner=owner,
-                    effects=effects,
-                    vector=fit.vector.tolist(),
-                    information=information.tolist(),
-                    covariance=clustered_covariance(linear, units).tolist(),
-                )
-                for owner in _owners(member, effects[member])
-            ]
-        return rivals
 
-    def _spread(self, name: str) -> float:
-        """Return the relative standard deviation, over scans, of the evidence for an effect, i.e. of the
-        decrease of the squared error. The part that noise causes is subtracted in quadrature, and the result
-        is at most 1.
+def _rivals(study: Study, twins: Mapping[str, Twin]) -> list[Rival]:
+    """Fit the model of each effect to all scans. Return the fitted models as rivals."""
+    study.report(f"fitting the rivals {', '.join(twins)}")
+    windows, units = study.windows, independent(study.scans)
+    stands_for = sum(w.usable.sum() for w in windows) / sum(len(w.sample) for w in windows)
+    rivals = []
+    for name, fit in fit_rivals(twins, windows).items():
+        fitted = twins[name].at(fit.vector)
+        effects, free = fitted.values(), fitted.free()[:, None]
+        linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
+        information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
+        rivals += [
+            Rival(
+                effect=name,
+                owner=owner,
+                effects=effects,
+                vector=fit.vector.tolist(),
+                information=information.tolist(),
+                covariance=clustered_covariance(linear, units).tolist(),
+            )
+            for owner in _owners(name, effects[name])
+        ]
+    return rivals
 
-        Let d be the change that the effect makes to the prediction of a scan, and a the multiple of d that
-        fits the scan best. The squared errors of the scan without and with the effect differ by |d|² (2 a -
-        1) plus noise, where a is 1 on average. The relative spread of this difference is therefore twice the
-        spread of a. If the strength differs between groups of scans, d contains these differences, so they do
-        not contribute to the spread.
-        """
-        without = self.closed.final.without(name).maps_um(self.study.scans)
-        multiples, own = [], []
-        for before, after in zip(map(left_nm, self.study.scans, without), self.left_nm, strict=True):
-            change = np.nan_to_num(before - after)
-            size = float((change**2).sum())
-            if size:
-                multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
-                own.append(float(self.noise.variance(torch.from_numpy(change))) / size**2)
-        # The spread is estimated robustly (from the median absolute deviation), because a scan may have a
-        # defect.
-        spread = median_abs_deviation(multiples, scale=0.6745)
-        return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
+
+def _spread(closed: Closed, name: str, left: Sequence[np.ndarray], noise: NoiseSpectrum) -> float:
+    """Return the relative standard deviation, over scans, of the evidence for an effect, i.e. of the decrease
+    of the squared error. The part that noise causes is subtracted in quadrature, and the result is at most 1.
+
+    Let d be the change that the effect makes to the prediction of a scan, and a the multiple of d that fits
+    the scan best. The squared errors of the scan without and with the effect differ by |d|² (2 a - 1) plus
+    noise, where a is 1 on average. The relative spread of this difference is therefore twice the spread of a.
+    If the strength differs between groups of scans, d contains these differences, so they do not contribute
+    to the spread.
+
+    Args:
+        closed: the loop.
+        name: name of the effect.
+        left: residual of each scan with the effect, nm, as returned by ``left_nm``.
+        noise: spectrum of the noise in these residuals.
+    """
+    scans = closed.study.scans
+    without = closed.final.without(name).maps_um(scans)
+    multiples, own = [], []
+    for before, after in zip(map(left_nm, scans, without), left, strict=True):
+        change = np.nan_to_num(before - after)
+        if size := (change**2).sum():
+            multiples.append(np.nansum(change * before) / size)
+            own.append(float(noise.variance(torch.from_numpy(change))) / size**2)
+    # The spread is estimated robustly (from the median absolute deviation), because a scan may have a defect.
+    spread = median_abs_deviation(multiples, scale=0.6745)
+    return min(2 * float(np.sqrt(max(spread**2 - np.median(own), 0.0))), 1.0)
 
 
 def _with(twin: Twin, one: Screened) -> Twin:

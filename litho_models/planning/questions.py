@@ -21,6 +21,7 @@ from pydantic import Field
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from litho_data.foundation import Array
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness.spectrum import hann
@@ -45,7 +46,7 @@ class NoiseSpectrum(Record):
 
     power_nm2: list[list[float]]
 
-    def on_grid(self, shape: tuple[int, ...]) -> np.ndarray:
+    def on_grid(self, shape: tuple[int, ...]) -> Array:
         """Interpolate the power spectrum, nm², at the frequencies that ``np.fft.fft2`` uses for a map of the
         given shape. The result has the given shape.
         """
@@ -62,36 +63,41 @@ class NoiseSpectrum(Record):
         return (torch.fft.fft2(change).abs() ** 2 * power).sum((-2, -1)) / power.numel()
 
 
-def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
+def inner(shape: Sequence[int]) -> tuple[slice, slice]:
+    """Return the index of a map of the given shape (ny, nx) without its border, where the prediction depends
+    on surroundings that are not part of the map.
+    """
+    border = sample_border_px(min(shape))
+    return (slice(border, -border),) * 2
+
+
+def left_nm(scan: PreparedScan, prediction_um: Array) -> Array:
     """Fit the free per-scan terms to the residual of a scan (measured minus predicted height), and subtract
     them. Return the remaining residual, nm. The result is a two-dimensional map without the pixels at the
     edge of the scan.
 
     Pixels that were not measured are NaN.
     """
-    border = sample_border_px(min(scan.stored.shape))
-    inner = (slice(border, -border),) * 2
-    used = scan.usable[inner]
-    freed = freed_um(scan.stored.height_um[inner], prediction_um[inner], used, ALL_FREE)
+    at = inner(scan.stored.shape)
+    used = scan.usable[at]
+    freed = freed_um(scan.stored.height_um[at], prediction_um[at], used, ALL_FREE)
     return np.where(used, NM_PER_UM * freed, np.nan)
 
 
-def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
+def noise_spectrum(residuals_nm: Sequence[Array]) -> NoiseSpectrum:
     """Compute the noise spectrum from the residual maps that ``left_nm`` returns. Only tiles without missing
     pixels are used. If there is no such tile, the spectrum of white noise with the variance of the residuals
     is returned.
     """
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
     window = hann((size, size))
-    window /= np.sqrt((window**2).mean())
-    powers: list[np.ndarray] = []
+    powers = []
     for residual in residuals_nm:
-        every = sliding_window_view(residual, (size, size))[:: size // 2, :: size // 2]
+        every = sliding_window_view(residual, window.shape)[:: size // 2, :: size // 2]
         tiles = every[np.isfinite(every).all(axis=(2, 3))]
         about_mean = tiles - tiles.mean(axis=(1, 2), keepdims=True)
-        powers += [*np.abs(np.fft.fft2(about_mean * window)) ** 2 / size**2]
-    if not powers:
-        powers = [np.full((size, size), np.mean([*map(np.nanvar, residuals_nm)]))]
+        powers += [*np.abs(np.fft.fft2(about_mean * window)) ** 2 / (window**2).sum()]
+    powers = powers or [np.full(window.shape, np.mean([*map(np.nanvar, residuals_nm)]))]
     return NoiseSpectrum(power_nm2=np.mean(powers, axis=0).round(3).tolist())
 
 
@@ -133,9 +139,9 @@ class Rival(Record):
         If this answer assumes that the printer causes the effect, the effect rotates with the print. If it
         assumes the microscope, the effect rotates with the scan.
         """
-        frames: dict[str, Frame] = {"microscope": "scan", "printer": "print"}
-        own = {self.effect: frames[self.owner]} if self.owner else {}
-        return replace(base.with_effects(self.effects), frames=own).at(np.array(self.vector))
+        frame: Frame = "print" if self.owner == "printer" else "scan"
+        frames = {self.effect: frame} if self.owner else {}
+        return replace(base.with_effects(self.effects), frames=frames).at(np.array(self.vector))
 
 
 class Question(Record):

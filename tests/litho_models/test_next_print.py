@@ -49,7 +49,7 @@ from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
 from litho_models.planning.layouts import Limits, assemble, climb, score, starts
-from litho_models.planning.open_questions import _Asking, _cutoff_per_um, _owners, _question, open_questions
+from litho_models.planning.open_questions import _cutoff_per_um, _owners, _question, _rivals, open_questions
 from litho_models.planning.questions import (
     NoiseSpectrum,
     OpenQuestions,
@@ -846,8 +846,7 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
     known = []
     for study in (scans, few):
         own = SimpleNamespace(windows=study, scans=scans, report=lambda message: None)
-        asking = SimpleNamespace(study=own)
-        known += [np.trace(_Asking._rivals(cast(Any, asking), {name: model(SLOPE)})[0].information)]
+        known += [np.trace(_rivals(cast(Any, own), {name: model(SLOPE)})[0].information)]
     # An evenly drawn quarter of the pixels gives a quarter of the sum, which is then scaled up.
     assert known[1] == pytest.approx(known[0], rel=0.1)
 
