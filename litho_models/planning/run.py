@@ -11,14 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 
 from litho_data.cards.card import Use
+from litho_data.foundation import Array, InputError, record_sha256
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
-from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.run_facts import run_info
 from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import flat, framed_ladder
@@ -33,6 +30,7 @@ from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint, PlannedScan
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import TURNED, Print, Rivalry
+from litho_models.simulator import SimulatorConfig
 
 # Number of planned prints on which the rivals (competing explanations) are finally compared. More prints are
 # not needed for this comparison, because they consist of the same tiles.
@@ -41,7 +39,6 @@ _FEWEST_PRINTS, _TILES = 2, 4
 _TILE_PX, _SMALLEST_PX = 256, 64
 PRINT_PATTERN = r"N(?P<print>\d+)F\d+"
 PRINTER_SHEET, MICROSCOPE_SHEET = "printer.md", "microscope.md"
-_TEMPLATES = Path(__file__).parent
 HOLDS = (
     "card.toml",
     "scans.csv",
@@ -57,12 +54,6 @@ _REFERENCES = {
     "flat": "shows the noise floor",
     "steps": "shows the height of each level; on a step standard, the gain of the microscope",
     "grating": "shows the lateral scales and the uneven motion of the scanner, and the tip",
-}
-# Descriptions of the reference layouts on the sheet for the printer.
-_USES = {
-    "substrate": "bare substrate, nothing printed: shows zero, tilt and bow of the microscope",
-    "flat": "one level everywhere: shows the noise floor",
-    "steps": "a staircase of levels: shows the height of each level",
 }
 # ``_PERIODS_UM``: periods of commercial gratings, µm. ``_FEWEST_PERIODS``: smallest number of periods that a
 # scan must contain.
@@ -101,14 +92,7 @@ def next_print(
             have only one level, ``prints`` is not between 1 and 12, ``field_um`` is too small, or ``out``
             contains a plan with other settings.
     """
-    folder = Path(loop)
-    if not (folder / OpenQuestions.FILE_NAME).is_file():
-        raise InputError(
-            f"no {OpenQuestions.FILE_NAME} in {loop}",
-            wanted="the folder of a closed loop",
-            hint="litho-models close-loop writes this file",
-        )
-    open_ = OpenQuestions.read(folder)
+    open_ = OpenQuestions.read(Path(loop) / OpenQuestions.FILE_NAME)
     if not open_.questions:
         return None
     if open_.instrument == "sem":
@@ -117,18 +101,19 @@ def next_print(
         )
     asked = {"prints": prints, "field_um": field_um, "seed": seed, "steps": steps, "layouts": layouts}
     facts = {"dataset": open_.dataset.model_dump(mode="json"), "settings": asked}
-    card = ModelCard.read(folder / MODEL_FOLDER)
-    size_px = round(field_um / card.pitch_um)
+    model = Path(loop) / MODEL_FOLDER
+    base = load_simulator(model, ModelCard.read(model))
+    geometry = base.config
+    size_px = round(field_um / geometry.pitch_um)
     if size_px < _SMALLEST_PX or prints not in COUNTS:
         raise InputError(
             "planned prints",
             got=f"{prints} of {field_um:g} µm",
-            wanted=f"1 to {max(COUNTS)} prints with a side of at least {_SMALLEST_PX * card.pitch_um:g} µm",
+            wanted=f"1 to {max(COUNTS)} prints with a side of at least "
+            f"{_SMALLEST_PX * geometry.pitch_um:g} µm",
         )
     with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
-        base = load_simulator(folder / MODEL_FOLDER, card)
-        limits = Limits.of(open_, card.pitch_um)
-        geometry = base.config
+        limits = Limits.of(open_, geometry.pitch_um)
         plain = FieldContext(
             torch.zeros(1, 1, size_px, size_px),
             geometry.pitch_um,
@@ -183,7 +168,7 @@ def next_print(
             scans=scans,
             questions=questions,
         )
-        write_plan(target, plan, maps, card, open_)
+        write_plan(target, plan, maps, geometry, open_)
         write_report(target, plan, levels, rivalries, planned[0][-1])
     shutil.rmtree(cache, ignore_errors=True)
     return plan
@@ -191,19 +176,19 @@ def next_print(
 
 def schedule(
     planned: Sequence[Print],
-    levels: Sequence[np.ndarray],
+    levels: Sequence[Array],
     ways: Sequence[str],
     limits: Limits,
     plain: FieldContext,
     seed: int,
-) -> tuple[list[PlannedScan], list[np.ndarray]]:
+) -> tuple[list[PlannedScan], list[Array]]:
     """Return the planned scans, which are the rows of the table ``scans.csv``, and the level map of each
     scan. The scans of the references (substrate, flat, steps and grating) come first. Without room or levels
     for three steps, there is no reference with steps.
     """
     size_px, lowest, highest = len(levels[0]), limits.lowest, limits.highest
     unprinted = flat((size_px, size_px), level=0)
-    references: dict[Use, np.ndarray] = {
+    references: dict[Use, Array] = {
         "substrate": unprinted,
         "flat": flat((size_px, size_px), level=(lowest + highest) // 2),
     }
@@ -239,7 +224,7 @@ def schedule(
 
 
 def write_plan(
-    folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], card: ModelCard, open_: OpenQuestions
+    folder: Path, plan: NextPrint, layouts: Sequence[Array], geometry: SimulatorConfig, open_: OpenQuestions
 ) -> None:
     """Write the files of a plan: the dataset card, the table of scans, the layouts, the record, and the
     sheets for printer and microscope.
@@ -248,7 +233,7 @@ def write_plan(
         folder: folder of the plan.
         plan: the record.
         layouts: the level map of each scan.
-        card: card of the corrected model, which states the pitch and the levels of the prints.
+        geometry: configuration of the base model, which states the pitch and the levels of the prints.
         open_: the open questions of the closed loop.
     """
     for scan, level in zip(plan.scans, layouts, strict=True):
@@ -260,9 +245,9 @@ def write_plan(
         folder,
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide the open questions on {plan.dataset.name}",
-        pitch_um=card.pitch_um,
-        level_height_um=card.level_height_um,
-        levels=card.levels,
+        pitch_um=geometry.pitch_um,
+        level_height_um=geometry.level_height_um,
+        levels=geometry.levels,
         scan_size_um=(plan.field_um, plan.field_um),
         ids={"print": PRINT_PATTERN, "table": TABLE_NAME},
         instrument=open_.instrument,
@@ -276,7 +261,6 @@ def write_plan(
     )
     plan.write(folder)
     for name in (PRINTER_SHEET, MICROSCOPE_SHEET):
-        template = _TEMPLATES / f"{name}.jinja"
-        text = filled(template, plan=plan, uses=_USES, grating_um=grating_um, slow_axis=open_.slow_axis)
-        with atomic_file(folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        template = Path(__file__).with_name(f"{name}.jinja")
+        text = filled(template, plan=plan, grating_um=grating_um, slow_axis=open_.slow_axis)
+        (folder / name).write_text(text, encoding="utf-8")
