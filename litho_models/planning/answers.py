@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import f as f_distribution
-from scipy.stats import norm
+from scipy.stats import f, norm
 
 from litho_data.reports.page import filled
 from litho_models.loop.judging import CONFIRM_P
@@ -61,9 +60,17 @@ def of_repeats(prints: int, scans: int) -> float:
     """
     if prints < 2 or scans < 2:
         return 0.0
-    law = f_distribution(prints - 1, prints * (scans - 1))
-    ratio = 1 + scans * PRINT_SHARE / (1 - PRINT_SHARE)
-    return float(min(law.sf(law.isf(CONFIRM_P) / ratio), law.cdf(ratio * law.ppf(CONFIRM_P))))
+    law, factor = variance_ratio(prints, prints * scans)
+    return float(min(law.sf(law.isf(CONFIRM_P) / factor), law.cdf(factor * law.ppf(CONFIRM_P))))
+
+
+def variance_ratio(prints: int, scans: int) -> tuple[Any, float]:
+    """Return what is expected of the variance of a per-scan term between prints, divided by its variance
+    between the scans of one print. ``scans`` is the number of scans of all prints together. The result has
+    two items: the distribution of the ratio if the microscope causes the term, and the factor by which the
+    ratio is larger if the printer causes the term.
+    """
+    return f(prints - 1, scans - prints), 1 + scans / prints * PRINT_SHARE / (1 - PRINT_SHARE)
 
 
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:

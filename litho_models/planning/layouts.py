@@ -19,8 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation import Array, InputError, atomic_file
 from litho_data.layouts.patterns import checkerboard, line_space_sweep
 from litho_data.layouts.random_layout import random_layout
 from litho_data.register.coarse import SEARCH_BLUR_PX
@@ -81,9 +80,9 @@ class Limits:
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
-        lowest = int(np.argmax(np.cumsum(share) >= _RARE))
-        highest = len(share) - 1 - int(np.argmax(np.cumsum(share[::-1]) >= _RARE))
-        if not open_.cutoff_per_um or lowest == highest:
+        below, above = np.cumsum(share), np.cumsum(share[::-1])[::-1]
+        known = levels[(below >= _RARE) & (above >= _RARE)].tolist()
+        if not open_.cutoff_per_um or len(known) == 1:
             raise InputError(
                 "layouts of the earlier prints",
                 got="a single level in each of them",
@@ -92,7 +91,7 @@ class Limits:
             )
         mean = float(share @ levels)
         sd = float(np.sqrt(share @ (levels - mean) ** 2))
-        return cls(lowest, highest, open_.cutoff_per_um, pitch_um, mean, sd)
+        return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
         """Apply a low-pass filter to unrestricted values, and clip them to the range of the levels. The
@@ -102,7 +101,7 @@ class Limits:
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
 
-    def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
+    def random(self, size_px: int, seed: int, finest: float = 1.0) -> Array:
         """Make a random layout with whole levels, of shape (size_px, size_px). ``finest`` is its cut-off
         frequency as a fraction of the highest allowed frequency.
         """
@@ -117,7 +116,7 @@ class Limits:
         return np.maximum(level, self.lowest)
 
 
-def starts(size_px: int, limits: Limits, seed: int) -> dict[str, np.ndarray]:
+def starts(size_px: int, limits: Limits, seed: int) -> dict[str, Array]:
     """Return the layouts from which an optimisation may start, keyed by name. Each layout consists of level
     numbers and has shape (size_px, size_px).
 
@@ -127,17 +126,14 @@ def starts(size_px: int, limits: Limits, seed: int) -> dict[str, np.ndarray]:
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
     inset = size_px // 5
     shape = (size_px - 2 * inset,) * 2
-    sweep = partial(line_space_sweep, shape, narrowest_px=feature, high=limits.highest, low=limits.lowest)
-    patterns = {
-        "checkerboard": checkerboard(shape, cell_px=2 * feature, high=limits.highest, low=limits.lowest),
-        "lines": sweep(),
-        "lines-along-x": sweep(along="x"),
-    }
+    low, high = limits.lowest, limits.highest
+    lines = line_space_sweep(shape, narrowest_px=feature, high=high, low=low)
+    squares = checkerboard(shape, cell_px=2 * feature, high=high, low=low)
     found = {
         f"random-{number + 1}": limits.random(size_px, seed + number, finest)
         for number, finest in enumerate((1.0, 0.5, 0.8))
     }
-    for name, pattern in patterns.items():
+    for name, pattern in {"checkerboard": squares, "lines": lines, "lines-along-x": lines.T}.items():
         found[name] = limits.random(size_px, seed + 7)
         found[name][inset:-inset, inset:-inset] = pattern
     return found
@@ -150,17 +146,17 @@ def score(rivalry: Rivalry, prints: Sequence[Print]) -> float:
 
 def climb(
     rivalry: Rivalry,
-    start: np.ndarray,
+    start: Array,
     scans_of: Callable[[Tensor], Print],
     limits: Limits,
     steps: int,
-) -> np.ndarray:
+) -> Array:
     """Increase the separation of the rivals by gradient ascent from the layout ``start``. Return the best
     soft (not rounded) levels, of shape (ny, nx). The function ``scans_of`` plans the scans of a layout.
     """
     free = torch.tensor(start, dtype=torch.float32, requires_grad=True)
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
-    best, highest = start.astype(np.float32), -np.inf
+    found = []
     for step in range(steps + 1):
         soft = limits.soft(free)
         fresh = step % _REFIT_EVERY == 0 or step == steps
@@ -169,8 +165,8 @@ def climb(
         apart = rivalry.separations([scans_of(soft)], refitted)
         # The separation is exact only in steps in which the rivals have been refitted to the current layout,
         # so only these steps may give the best layout.
-        if fresh and apart.min().item() > highest:
-            best, highest = soft.detach().numpy().copy(), apart.min().item()
+        if fresh:
+            found.append((apart.min().item(), soft.detach().numpy()))
         # The negative log-sum-exp is a soft minimum over the pairs of rivals. With a hard minimum, the ascent
         # would alternate between pairs.
         far = (soft.mean() - limits.mean).abs() + (soft.std() - limits.sd).abs()
@@ -178,10 +174,10 @@ def climb(
         climber.zero_grad()
         (penalty + torch.logsumexp(-apart, 0)).backward()
         climber.step()
-    return best
+    return max(found, key=lambda one: one[0])[1]
 
 
-def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
+def assemble(tiles: Sequence[Array], number: int, size_px: int, limits: Limits) -> Array:
     """Assemble the tiles of a print into a layout with whole level numbers, which the printer can print. The
     order of the tiles depends on ``number``, the number of the print, so it differs between prints. The
     result has shape (size_px, size_px).
@@ -208,7 +204,7 @@ class Chosen(NamedTuple):
     weaker: bool
     tried: dict[str, float]
 
-    def prints(self, levels: Sequence[np.ndarray], plain: FieldContext, count: int) -> list[Print]:
+    def prints(self, levels: Sequence[Array], plain: FieldContext, count: int) -> list[Print]:
         """Plan the scans of the first prints of a series of ``count`` prints, given the levels of each of
         their layouts. ``plain`` is as for ``planned_scans``.
         """
@@ -225,7 +221,7 @@ class Chosen(NamedTuple):
         ]
 
 
-def choose(rivalry: Rivalry, level: np.ndarray, plain: FieldContext) -> Chosen:
+def choose(rivalry: Rivalry, level: Array, plain: FieldContext) -> Chosen:
     """Choose the ways to print and scan that best separate the rivals of a question.
 
     Args:
@@ -280,7 +276,7 @@ def _worth(more: float, reached: float) -> bool:
 def climbed(
     rivalries: Sequence[Rivalry],
     chosen: Chosen,
-    starting: Mapping[str, np.ndarray],
+    starting: Mapping[str, Array],
     limits: Limits,
     plain: FieldContext,
     count: int,
@@ -288,7 +284,7 @@ def climbed(
     steps: int,
     kept: Path,
     report: Callable[[str], None],
-) -> list[np.ndarray]:
+) -> list[Array]:
     """Optimise ``count`` tiles. Each tile is optimised for one question. Successive tiles cycle through the
     questions. Return the soft (not rounded) levels of each tile.
 
@@ -304,8 +300,7 @@ def climbed(
             reused.
         report: function that receives the progress messages.
     """
-    kept.mkdir(parents=True, exist_ok=True)
-    report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
+    report(f"{len([*kept.glob('[0-9]*.npy')])} of {count} tiles are kept from an earlier run")
     scans_of = partial(planned_scans, plain, ways=chosen.ways)
     able = [one for one in starting.items() if _repeats(one[1]) <= _MOST_REPEATING]
     ranked = [sorted(able, key=lambda one: -score(rivalry, [scans_of(one[1])])) for rivalry in rivalries]
@@ -324,7 +319,7 @@ def climbed(
     return tiles
 
 
-def _repeats(level: np.ndarray) -> float:
+def _repeats(level: Array) -> float:
     """Return the self-similarity of a layout: how well it matches shifted copies of itself, as the
     registration would measure it.
 

@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import f as f_distribution
 from scipy.stats import f_oneway
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import Array, InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
@@ -35,7 +34,7 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision, ScanFinding
 from litho_models.loop.single_scans import coefficients
-from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
+from litho_models.planning.answers import Z_DECIDED, surely_better, variance_ratio
 from litho_models.planning.open_questions import open_questions
 from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
 from litho_models.scan_terms import freed_um, row_index, shrunk_line_offsets, terms_of_effect
@@ -103,8 +102,8 @@ def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]
                 got=getattr(store, name),
                 wanted=f"{getattr(first, name)}, as in {first.path}",
             )
-    planned = store.manifest.get("card", {}).get("plan", {}).get("dataset_sha256")
-    if planned is not None and planned != first.sha256:
+    planned = store.manifest.get("card", {}).get("plan", {}).get("dataset_sha256", first.sha256)
+    if planned != first.sha256:
         raise InputError(
             f"store {store.path}",
             got=f"prints planned for dataset {planned[:12]}…",
@@ -191,13 +190,12 @@ class Judge:
         if count < 2:
             return _decision(question, self.new, BOTH, "no print was scanned twice", UNSEEN)
         ratio = float(np.median(f_oneway(*repeated).statistic))
-        law = f_distribution(count - 1, total - count)
-        expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
+        law, factor = variance_ratio(count, total)
         told = (
             "the ratio of the variance between prints to the variance between scans of one print is "
             f"F({count - 1}, {total - count}) = {ratio:.2f}"
         )
-        left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P)
+        left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / factor) <= CONFIRM_P)
         return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
@@ -260,7 +258,7 @@ def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Dec
 
 
 def compared(
-    question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[np.ndarray]]
+    question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[Array]]
 ) -> Decision:
     """Judge the answers to a question by their residuals on the new scans.
 
@@ -297,7 +295,7 @@ def compared(
 
 def _compare(
     pair: tuple[str, str],
-    left_nm: Mapping[str, Sequence[np.ndarray]],
+    left_nm: Mapping[str, Sequence[Array]],
     new: Sequence[PreparedScan],
     question: Question,
 ) -> Comparison:
@@ -307,7 +305,7 @@ def _compare(
     compared with its spread over the blocks of a print and with its spread between prints. If the scans of a
     print differ in size, their blocks do not correspond. The scans of each size are then treated separately.
     """
-    by_print: dict[tuple[str, tuple[int, ...]], np.ndarray] = {}
+    by_print: dict[tuple[str, tuple[int, ...]], Array] = {}
     pixels, difference = 0, 0.0
     for scan, first, second in zip(new, *(left_nm[name] for name in pair), strict=True):
         pixels += int(np.isfinite(first).sum())
@@ -328,7 +326,7 @@ def _compare(
     )
 
 
-def _block_sums(gain: np.ndarray) -> np.ndarray:
+def _block_sums(gain: Array) -> Array:
     sums = np.nan_to_num(gain)
     for axis, size in enumerate(gain.shape):
         count = max(2, size // _BLOCK_PX)
@@ -366,11 +364,11 @@ def _decision(
     return Decision(
         question=question.name,
         kind=question.kind,
-        declared=[rival.name for rival in question.rivals] or list(BOTH),
-        left=list(left),
+        declared=[rival.name for rival in question.rivals] or BOTH,
+        left=left,
         verdict=verdict or ("decided" if len(left) == 1 else "still open"),
         evidence=evidence,
         prints=len({scan.stored.print_id for scan in scans}),
         scans=len(scans),
-        comparisons=list(comparisons),
+        comparisons=comparisons,
     )
