@@ -28,8 +28,8 @@ from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import Linearised, eliminated_sum, orthonormal, solve_damped
 from litho_models.loop.fits import RULES
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import ALL_FREE, sample_border_px
-from litho_models.planning.questions import NoiseSpectrum, Question
+from litho_models.loop.prepared import ALL_FREE
+from litho_models.planning.questions import NoiseSpectrum, Question, inner
 from litho_models.scan_terms import TermPixels, term_maps
 from litho_models.simulator import Simulator
 
@@ -71,8 +71,9 @@ def planned_scans(
         order: position in the writing order, from -0.5 (first) to 0.5 (last).
         dose: dose relative to earlier prints.
     """
-    radius_um = plain.field_radius_um if at_edge else None
-    reach_um = 0.0 if radius_um is None else radius_um - max(level.shape) * plain.pitch_um / 2
+    reach_um = 0.0
+    if at_edge and plain.field_radius_um:
+        reach_um = plain.field_radius_um - max(level.shape) * plain.pitch_um / 2
     printed = replace(
         plain,
         layout_um=(dose * plain.slice_um * torch.as_tensor(level, dtype=torch.float32))[None, None],
@@ -103,7 +104,7 @@ def linearised(twins: Mapping[str, Twin], scan: FieldContext) -> dict[str, Linea
     for name, twin in twins.items():
         steps = twin.steps()
         moved = (twin.at(twin.vector + one) for one in np.diag(steps))
-        heights = _inner(torch.stack([predict(one, scan, known) for one in (twin, *moved)]))
+        heights = _stacked([predict(one, scan, known) for one in (twin, *moved)])
         rows = _rows(heights)
         derivatives = (rows[1:] - rows[0]) / steps[:, None]
         found[name] = Linearised(-rows[0], derivatives, _free_basis(heights[0]).T)
@@ -162,10 +163,9 @@ class Rivalry:
         """
         other = copy.copy(self)
         other.true = {}
-        for rival in self.question.rivals:
-            twin = self.twins[rival.name]
+        for rival, (name, twin) in zip(self.question.rivals, self.twins.items(), strict=True):
             moved = random.multivariate_normal(0 * twin.vector, rival.covariance)
-            other.true[rival.name] = twin.at(twin.vector + np.clip(moved, *twin.room()))
+            other.true[name] = twin.at(twin.vector + np.clip(moved, *twin.room()))
         return other
 
     def refitted(
@@ -240,15 +240,12 @@ def _predicted(twin: Twin, prints: Sequence[Print]) -> Tensor:
     """Predict the height in all scans of the prints, without its border. The result has shape (scans, ny,
     nx).
     """
-    return _inner(torch.stack([predict(twin, scan) for scans in prints for scan in scans]))
+    return _stacked([predict(twin, scan) for scans in prints for scan in scans])
 
 
-def _inner(fields: Tensor) -> Tensor:
-    """Crop the border of fields of shape (n, ny, nx), where the prediction depends on surroundings that are
-    not part of the field.
-    """
-    border = sample_border_px(min(fields.shape[1:]))
-    return fields[:, border:-border, border:-border]
+def _stacked(heights: Sequence[Tensor]) -> Tensor:
+    """Stack predictions of shape (ny, nx) without their borders."""
+    return torch.stack([height[inner(height.shape)] for height in heights])
 
 
 def _rows(fields: Tensor) -> np.ndarray:
