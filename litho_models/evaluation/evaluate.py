@@ -75,8 +75,8 @@ def evaluate(
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Evaluation.FILE_NAME, subject):
         every = dataset.scans()
-        locked = locked_scans(frozen, dataset)
-        locked_too = open_lock_box or not made_of_these_prints(frozen, dataset)
+        locked = locked_scans(frozen.card, dataset)
+        locked_too = open_lock_box or not made_of_these_prints(frozen.card, dataset)
         scans = [scan for scan in every if locked_too or scan.id not in locked]
         if not scans:
             raise InputError(f"scans of {store} to score", got="none", wanted="at least one")
@@ -105,7 +105,7 @@ def evaluate(
             ),
             nuisance=protocol,
             noise_floor=floor,
-            trained_on_scored_scans=sorted(trained_ids(frozen, dataset) & set(ids)),
+            trained_on_scored_scans=sorted(trained_ids(frozen.card, dataset) & set(ids)),
             scores=score_model(frozen.name, scans, predictions, protocol),
         )
         write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)

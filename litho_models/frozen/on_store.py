@@ -2,8 +2,9 @@
 trained.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,30 +63,30 @@ def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Bac
     return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
 
 
-def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
-    """Return the ids of the scans on which the model was trained. The set is empty if the model was trained
-    on other prints.
+def trained_ids(card: Mapping[str, Any], dataset: Store) -> set[str]:
+    """Return the ids of the scans on which the model with this card was trained. The set is empty if the
+    model was trained on other prints.
     """
-    return set(model.card["training"].get("scan_ids", [])) if made_of_these_prints(model, dataset) else set()
+    return set(card["training"].get("scan_ids", [])) if made_of_these_prints(card, dataset) else set()
 
 
-def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Return True if the model was trained on the prints in this store. The prints are taken to be the same
-    if the model's card states the hash of this dataset, or if the store contains scans that were locked when
-    the model was trained.
+def made_of_these_prints(card: Mapping[str, Any], dataset: Store) -> bool:
+    """Return True if the model with this card was trained on the prints in this store. The prints are taken
+    to be the same if the card states the hash of this dataset, or if the store contains scans that were
+    locked when the model was trained.
     """
-    same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
-    return same_dataset or bool(locked_by_the_card(model, dataset))
+    same_dataset = (card["dataset"] or {}).get("sha256") == dataset.sha256
+    return same_dataset or bool(locked_by_the_card(card, dataset))
 
 
-def locked_scans(model: FrozenSimulator, dataset: Store) -> list[str]:
+def locked_scans(card: Mapping[str, Any], dataset: Store) -> list[str]:
     """Return the sorted ids of the scans in a store that count as locked for a model: the scans that the
     store locks, and the scans that were locked when the model was trained.
     """
-    return sorted({*dataset.locked_ids, *locked_by_the_card(model, dataset)})
+    return sorted({*dataset.locked_ids, *locked_by_the_card(card, dataset)})
 
 
-def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
+def locked_by_the_card(card: Mapping[str, Any], dataset: Store) -> list[str]:
     """Return the ids of the scans in a store that were locked when the model was trained. The scans are
     recognised by their raw files.
 
@@ -94,8 +95,8 @@ def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     to the store or removed from it. If the card lists no raw files, the scans are recognised by their ids
     instead, but only if the store has the dataset name that the card states.
     """
-    split = model.card["split"]
+    split = card["split"]
     if files := split.get("lock_box_files_sha256"):
         return [scan_id for scan_id, file in dataset.files_sha256(dataset.ids).items() if file in files]
-    same_name = (model.card["dataset"] or {}).get("name") == dataset.name
+    same_name = (card["dataset"] or {}).get("name") == dataset.name
     return [scan_id for scan_id in split.get("lock_box", []) if same_name and scan_id in dataset.ids]

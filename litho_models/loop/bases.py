@@ -15,12 +15,13 @@ from torch import nn
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import run_jobs
-from litho_data.store import PrintedScan
+from litho_data.store import PrintedScan, Store
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
+from litho_models.frozen.on_store import trained_ids
 from litho_models.loop.fits import Study
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.prepared import exposed
@@ -41,6 +42,7 @@ def bases_for(
     cache: Path,
     fields: Mapping[str, Any] = {},
     nested: bool = False,
+    store: Store | None = None,
 ) -> dict[str, nn.Module]:
     """Return the base models that the loop may correct, keyed by name. If the base is a network, it is
     trained once for each fold, without the scans of this fold.
@@ -55,27 +57,34 @@ def bases_for(
         fields: settings of a small model, keyed by name, such as ``{"spot.sigma_um": 0.3}``.
         nested: whether all choices will be repeated without some of the scans. This needs a base that is
             refitted.
+        store: the store of the scans. A frozen model that is not refitted must not have been trained on
+            scans of this store.
 
     Raises:
-        InputError: the base is unknown, its pitch differs from that of the scans, settings are given for a
-            base that is not a small model, or ``nested`` is set for a base that is not refitted.
+        InputError: the base is unknown, its pitch differs from that of the scans, it was trained on scans of
+            ``store``, settings are given for a base that is not a small model, or ``nested`` is set for a
+            base that is not refitted.
     """
-    scans = study.stored
-    named = _built(base, scans[0], fields) if base in MODELS else None
-    if fields and not (named and is_small(named)):
+    scan = study.stored[0]
+    bases: dict[str, nn.Module]
+    if base == AUTO:
+        bases = {name: _built(name, scan) for name in _COMPETING}
+    elif base in MODELS:
+        bases = {base: _built(base, scan, fields)}
+    else:
+        bases = _frozen(base, scan.pitch_um, store)
+    small = all(map(is_small, bases.values()))
+    if fields and not (small and base in MODELS):
         raise InputError(
             f"settings of {base}", got=", ".join(fields), wanted="no settings, or the name of a small model"
         )
-    if base == AUTO:
-        return {name: _built(name, scans[0]) for name in _COMPETING}
-    name, model = _frozen(base, scans[0].pitch_um) if named is None else (base, named)
     # This is checked before a network is trained, which takes long.
-    if nested and not is_refitted(model):
+    if nested and not all(map(is_refitted, bases.values())):
         raise InputError(
             f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
         )
-    if named is None or is_small(model):
-        return {name: model}
+    if small or base not in MODELS:
+        return bases
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     recipe = TrainingConfig.of_recipe("fast", base, film=study.of_films, seed=study.seed, **given)
     return {base: train_folds(study, partial(fit_in_cache, base, config=recipe, cache=cache))}
@@ -86,13 +95,21 @@ def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simu
     return build_model(name, **common_geometry([scan]), **{**usual, **fields})
 
 
-def _frozen(base: str, pitch_um: float) -> tuple[str, Simulator]:
+def _frozen(base: str, pitch_um: float, store: Store | None) -> dict[str, nn.Module]:
     folder = zoo.model_folder(base, other=[AUTO, *MODELS])
     card = ModelCard.read(folder)
     if abs(card.pitch_um - pitch_um) > 1e-9:
         wanted = f"{pitch_um:g} µm, the pitch of the scans"
         raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=wanted)
-    return card.name, load_simulator(folder, card)
+    model = load_simulator(folder, card)
+    if store and not is_refitted(model) and trained_ids(card.model_dump(), store):
+        raise InputError(
+            f"base {base}",
+            got="a model that was trained on scans of this store, so no scan is held out",
+            wanted="a model of other prints",
+            hint="give the name of a model, such as pbl, to train it without each fold",
+        )
+    return {card.name: model}
 
 
 def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]) -> FoldedBase:
@@ -105,9 +122,9 @@ def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]
             is sent to other processes.
     """
     seen = [exposed(scan) for scan in study.stored]
+    jobs = [partial(trainer, [seen[i] for i in rest]) for rest, _ in study.folds]
     # The last model is trained on all scans.
-    parts = [*([seen[i] for i in rest] for rest, _ in study.folds), seen]
-    jobs = [partial(trainer, part) for part in parts]
+    jobs.append(partial(trainer, seen))
     done = run_jobs(call, jobs, study.workers, name=lambda job: f"fold {jobs.index(job)}")
     trained = dict(progress(done, "training the base model", len(jobs)))
     *models, common = (trained[job].model for job in jobs)

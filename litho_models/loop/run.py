@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,20 +20,18 @@ from litho_models.effects import get_effect
 from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.card import OUT_OF_FOLD
-from litho_models.frozen.files import MODEL_FILES, load_frozen, save_frozen
-from litho_models.frozen.on_store import trained_ids
+from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, errors_of_others, nested_errors
 from litho_models.loop.fits import Study
-from litho_models.loop.marks import rounding_um
-from litho_models.loop.model import FoldedBase, is_refitted
+from litho_models.loop.marks import rounding, rounding_um
+from litho_models.loop.model import FoldedBase
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.single_scans import SingleScans
-from litho_models.models import MODELS
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split
 
@@ -107,51 +104,47 @@ def close_loop(
     development = [scan for scan in usable if scan.id not in opened.locked_ids]
     if nested == "prints" and len({scan.print_id for scan in development}) < 2:
         raise InputError("--nested prints", got="scans of one print", wanted="scans of at least 2 prints")
-    study = Study.dealt(development, folds, seed, report=report)
     settings = {
         "base": base, "base_settings": dict(base_settings), "folds": folds, "nested": nested,
         "inject": list(inject), "steps": steps,
         "open_lock_box": open_lock_box, "seed": seed, "new_prints": list(decided_by),
     }  # fmt: skip
     facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
-    model_files = [f"{MODEL_FOLDER}/{name}" for name in MODEL_FILES]
+    model_files = (f"{MODEL_FOLDER}/{name}" for name in MODEL_FILES)
     holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", *model_files)
     with (
         whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,
     ):
-        study = replace(study, workers=places)
-        kept = Path(cache or f"{out}-cache")
+        study = Study.dealt(development, folds, seed, places, report)
         bases = bases_for(
-            base, study, steps=steps, cache=kept, fields=base_settings, nested=nested is not None
+            base,
+            study,
+            steps=steps,
+            cache=Path(cache or f"{out}-cache"),
+            fields=base_settings,
+            nested=nested is not None,
+            store=opened,
         )
-        refitted = all(map(is_refitted, bases.values()))
-        if not refitted and base not in MODELS and trained_ids(load_frozen(base), opened):
-            raise InputError(
-                f"base {base}",
-                got="a model that was trained on scans of this store, so no scan is held out",
-                wanted="a model of other prints",
-                hint="give the name of a model, such as pbl, to train it without each fold",
-            )
         closed = close(study, bases)
 
-        def close_again(among: Mapping[str, nn.Module], scans: Sequence[PrintedScan]) -> Closed:
+        def close_again(scans: Sequence[PrintedScan], among: Mapping[str, nn.Module] = bases) -> Closed:
             return close(Study.dealt(scans, folds, seed, places), among)
 
         models = HeldOut(study)
         alone: list[ScanFinding] = []
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
-            maps, steps_um = models.maps_um(closed.final), rounding_um(opened, development)
-            alone = SingleScans(study, maps, steps_um).findings()
+            alone = SingleScans(study, models.maps_um(closed.final)).findings()
+            alone += rounding(rounding_um(opened, development))
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
         errors, left_out_nm = models.errors(closed), models.left_out_nm(closed)
         if nested:
             chosen = {closed.base_name: bases[closed.base_name]}
-            errors += nested_errors(study, nested, partial(close_again, chosen))
+            errors += nested_errors(study, nested, partial(close_again, among=chosen))
         if open_lock_box and locked:
             errors += errors_of_others([(models, closed, locked)], locked, "locked", seed)
-        planted = [plant(*one, closed, partial(close_again, bases)) for one in wanted]
+        planted = [plant(*one, closed, close_again) for one in wanted]
         result = record(
             closed,
             errors,
@@ -190,7 +183,7 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     base = base.common if isinstance(base, FoldedBase) else base
     assert isinstance(base, Simulator)
     latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
-    values = closed.final.twin.chain(latest).values
+    values = closed.final.twin.values(latest)
     sides = {"process": "printer", "measurement": "microscope"}
 
     def on(*roles: str) -> dict[str, dict[str, float]]:

@@ -95,7 +95,7 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
             wanted="reference values",
             hint=hint,
         )
-    if made_of_these_prints(frozen, dataset):
+    if made_of_these_prints(frozen.card, dataset):
         raise InputError(
             f"store {dataset.path}",
             got="the prints from which the model was made",
@@ -112,9 +112,9 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
     """Compute the monitored values of the scans of a store. Add excluded scans to ``dropped``: scans of flat
     layouts and, if the model was trained on prints of this store, locked scans.
     """
-    seen, locked = trained_ids(frozen, store), []
-    if made_of_these_prints(frozen, store):
-        locked = locked_scans(frozen, store)
+    seen, locked = trained_ids(frozen.card, store), []
+    if made_of_these_prints(frozen.card, store):
+        locked = locked_scans(frozen.card, store)
         dropped += [f"{scan_id}: lock box" for scan_id in locked]
     rows = []
     for scan in (store.scan(scan_id) for scan_id in store.ids if scan_id not in locked):

@@ -138,10 +138,10 @@ def _of_frozen(store: Store, folder: Path) -> tuple[str, dict[str, Array], Nuisa
     frozen = load_frozen(folder)
     frozen.check_geometry(store.pitch_um, store.level_height_um)
     film = store.instrument == "sem"
-    locked = locked_scans(frozen, store)
+    locked = locked_scans(frozen.card, store)
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id not in locked]
     learned = card_background(frozen, scans) if usual_background(film) == "training" else None
     predictions = {scan.id: Prediction.beside(learned, scan, predict_frozen(frozen, scan)) for scan in scans}
     maps = {scan: prediction.map_um for scan, prediction in predictions.items()}
     protocol = NuisanceProtocol.of_policy(usual_policy(film), background="training" if learned else "none")
-    return frozen.name, maps, protocol, not trained_ids(frozen, store) & set(maps)
+    return frozen.name, maps, protocol, not trained_ids(frozen.card, store) & set(maps)
