@@ -55,8 +55,11 @@ def record(
         given: the remaining fields of the record.
     """
     study = closed.study
-    found = [*closed.traced, *closed.described.causes]
-    effects = [_found(closed, one, left_out_nm[one.name]) for one in found]
+    strengths = _strengths(closed)
+    effects = [
+        _found(closed, one, strengths[one.name], left_out_nm[one.name])
+        for one in (*closed.traced, *closed.described.causes)
+    ]
     headline = {row.model: row.leading_by_scan_nm for row in errors if row.is_headline}
     gains = [headline["base"][scan.id] - headline["all"][scan.id] for scan in study.scans]
     return CloseLoop(
@@ -105,7 +108,9 @@ def _values(twin: Twin) -> dict[str, float]:
     return {name: value.item() for name, value in known.items()}
 
 
-def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
+def _found(
+    closed: Closed, cause: Cause, strengths: dict[str, list[Strength]], left_out_nm: float
+) -> FoundEffect:
     effect, judgement, names = get_effect(cause.name), cause.judgement, [cause.name, *cause.alike]
     role, *others = {get_effect(name).role for name in names}
     knowledge = effect.knowledge
@@ -125,7 +130,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
         role=cause.role or ("undetermined" if others else role),
         verdict="explained" if cause.role else verdicts[knowledge],
         by=cause.by,
-        strengths=_strengths(closed, cause.name),
+        strengths=strengths,
         confusable_with=list(cause.alike),
         separating_experiment=separating(names),
         gain_nm2=judgement.gain_nm2,
@@ -139,31 +144,28 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     )
 
 
-def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Return the fitted values of the parameters of an effect, keyed by the name of the parameter. Their
-    confidence intervals are computed from the scatter over prints. If there are too few prints, or if a
-    strength applies to only one print, the scatter over scans is used instead. A strength that applies to
-    only one scan has no interval.
+def _strengths(closed: Closed) -> dict[str, dict[str, list[Strength]]]:
+    """Return the values of the parameters of all effects, keyed by the name of the effect and by the name of
+    the parameter. The confidence intervals of fitted values are computed from the scatter over prints. If
+    there are too few prints, or if a strength applies to only one print, the scatter over scans is used
+    instead. A strength that applies to only one scan has no interval.
     """
     twin, scans = closed.final.twin, closed.study.scans
-    kinds = independent(scans), [scan.id for scan in scans]
-    variances = [np.diag(clustered_covariance(closed.final.linear, units)) for units in kinds]
-    found = dict[str, list[Strength]]()
-    for at, slot in enumerate(twin.slots, twin.own):
-        if slot.effect == name:
-            own = [*map(slot.is_of, scans)]
-            # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single
-            # unit would be zero and would show no scatter.
-            pairs = zip(kinds, variances, strict=True)
-            known = next((pair for pair in pairs if len({*compress(pair[0], own)}) > 1), None)
-            value, ci95 = float(twin.vector[at]), None
-            if known and known[1][at] > 0:
-                ci95 = t.interval(0.95, len({*known[0]}) - 1, value, np.sqrt(known[1][at]))
-            strength = Strength(label=slot.label, value=value, unit=slot.facts.unit, ci95=ci95)
-            found.setdefault(slot.parameter, []).append(strength)
-    # Choices are not fitted.
-    for key, value in twin.values()[name].items():
-        found.setdefault(key, [Strength(value=value, unit=get_effect(name).parameters[key].unit)])
+    kinds = []
+    for units in (independent(scans), [scan.id for scan in scans]):
+        variances = np.diag(clustered_covariance(closed.final.linear, units))[twin.own :].tolist()
+        kinds.append((units, dict(zip(twin.slots, variances, strict=True))))
+    found: dict[str, dict[str, list[Strength]]] = {name: {} for name in twin.names}
+    for slot, value in twin.effects.items():
+        own, ci95 = [*map(slot.is_of, scans)], None
+        # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single unit
+        # would be zero and would show no scatter.
+        units, known = next((kind for kind in kinds if len({*compress(kind[0], own)}) > 1), ([], {}))
+        # Choices are not fitted, so they have no variance.
+        if known.get(slot, 0) > 0:
+            ci95 = t.interval(0.95, len({*units}) - 1, value, np.sqrt(known[slot]))
+        strength = Strength(label=slot.label, value=value, unit=slot.facts.unit, ci95=ci95)
+        found[slot.effect].setdefault(slot.parameter, []).append(strength)
     return found
 
 

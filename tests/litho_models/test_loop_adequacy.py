@@ -179,7 +179,6 @@ def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
     """Check that the cause may be missing on another base only if that base has more numbers than the chosen
     base.
     """
-    monkeypatch.setattr(results, "_strengths", lambda closed, name: {})
     cause = gaining("dose-exponent", 10)
     rivals = {
         name: Found(with_base(own), [replace(cause, name="hatch-ripple", alike=("dose-exponent",))])
@@ -189,7 +188,7 @@ def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
     }
     others = dict.fromkeys(("base", "named", "lawful", "described", "rest", "untestable"))
     closed = Closed(base_name="physics", rivals=rivals, plain=with_base(7), **others)
-    found = results._found(closed, cause, 0.1)
+    found = results._found(closed, cause, {}, 0.1)
     assert (found.knowledge, found.survives_on) == (knowledge, found_on)
 
 

@@ -343,7 +343,7 @@ def test_a_strength_of_one_print_is_unknown_where_this_print_is_left_out() -> No
 def test_the_interval_of_a_strength_of_one_print_comes_from_its_scans() -> None:
     size_um, state = _losses()
     closed = cast(Closed, SimpleNamespace(final=state, study=state.study))
-    for own in _strengths(closed, "slope-thinning")["along_x_um"]:
+    for own in _strengths(closed)["slope-thinning"]["along_x_um"]:
         assert own.ci95 is not None
         # The strengths differ from the true values by up to 0.9 standard errors.
         assert own.ci95[0] < size_um[own.label] < own.ci95[1]

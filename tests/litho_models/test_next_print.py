@@ -43,7 +43,7 @@ from litho_models.loop.judging import judge_states
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import CloseLoop, Decision
-from litho_models.loop.results import _candidates, _found
+from litho_models.loop.results import _candidates, _found, _strengths
 from litho_models.loop.search import Cause, Found
 from litho_models.models import build_model
 from litho_models.planning import answers
@@ -891,7 +891,7 @@ def test_what_is_decided_gets_its_owner_in_the_result() -> None:
     rivals = slope_question().rivals
     for left, role in ((AS_PRINTER, "process"), (AS_MICROSCOPE, "measurement")):
         after = with_decisions(before, *decided_for(left, among=rivals))
-        found = _found(after, after.named.causes[0], 0.0)
+        found = _found(after, after.named.causes[0], {}, 0.0)
         assert (found.role, found.verdict, found.confusable_with) == (role, "explained", [])
         assert after.final is before.final
     after = with_decisions(before, *decided_for(AS_PRINTER, AS_MICROSCOPE, among=rivals))
@@ -910,7 +910,7 @@ def test_an_excluded_cause_makes_way_for_the_one_that_remains() -> None:
     after = with_decisions(before, *decided_for("layer-stacking", among=rivals))
     assert after.final.twin.names == after.named.state.twin.names == ("layer-stacking",)
     assert before.final.twin.names == ("slope-thinning",)
-    [found] = [_found(after, one, 0.0) for one in after.traced]
+    [found] = [_found(after, one, _strengths(after)[one.name], 0.0) for one in after.traced]
     assert (found.name, found.role, found.verdict) == ("layer-stacking", "process", "explained")
     assert found.confusable_with == []
     # The fitted value is that of these scans and not that of the rival.
@@ -922,7 +922,7 @@ def test_an_excluded_cause_makes_way_for_the_one_that_remains() -> None:
         assert told[name].reason == "later prints exclude it: layer-stacking fits them better"
     # Two effects remain.
     after = with_decisions(before, *decided_for("layer-stacking", "diffusion-blur", among=rivals))
-    [found] = [_found(after, one, 0.0) for one in after.traced]
+    [found] = [_found(after, one, _strengths(after)[one.name], 0.0) for one in after.traced]
     assert (found.name, found.verdict) == ("layer-stacking", "confusable")
     assert found.confusable_with == ["diffusion-blur"]
     assert after.final.twin.names == ("layer-stacking",)
