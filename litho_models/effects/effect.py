@@ -77,7 +77,7 @@ class FieldContext:
         full_height_um: nominal height of the highest level, µm. Effects that change each pixel independently
             of its neighbours use it as their unit of height.
         slice_um: height of one printed slice, which is the height of one level, µm.
-        field_centre_um: position (y, x) of the centre of this field in the write field, µm.
+        field_centre_um: position (y, x) of the centre of the whole scan in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
         slow_axis: axis perpendicular to the written lines.
         order: position of this field in the writing order, scaled so that the positions in the dataset run
@@ -148,8 +148,9 @@ class FieldContext:
         tensors have shapes (ny, 1) and (1, nx).
         """
         rows, columns = pixel_numbers(self.layout_um)
-        (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
-        return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
+        (ny, nx), (top, left), (y, x) = self.whole_shape(), self.origin_px, self.field_centre_um
+        rows, columns = rows + top - (ny - 1) / 2, columns + left - (nx - 1) / 2
+        return rows * self.pitch_um + y, columns * self.pitch_um + x
 
     def whole_shape(self) -> tuple[int, int]:
         """Return the numbers of rows and columns of the whole scan."""
@@ -165,11 +166,11 @@ class FieldContext:
 
     def radius_um(self) -> float:
         """Return half the width of the write field, µm. If the dataset card (the TOML file that describes a
-        campaign) states no write field, return half the longer side of this field.
+        campaign) states no write field, return half the longer side of the whole scan.
         """
         if self.field_radius_um is not None:
             return self.field_radius_um
-        return max(self.layout_um.shape[-2:]) * self.pitch_um / 2
+        return max(self.whole_shape()) * self.pitch_um / 2
 
 
 Apply = Callable[[Tensor, Values, FieldContext], Tensor]

@@ -104,7 +104,7 @@ class PreparedScan:
         Successive scans use different quadrants, so that together they cover the whole field. A quadrant with
         few measured pixels is replaced by the quadrant that has the most measured pixels.
         """
-        shape, context = self.stored.shape, self.context
+        shape = self.stored.shape
         if min(shape) < LARGE_PX:
             return self
         quadrants = [Crop(self.id, number).slices(shape) for number in (0, 2, 1, 3)]
@@ -123,15 +123,9 @@ class PreparedScan:
             valid=sampled[area],
             height_sigma_um=None,
         )
-        y_um, x_um = (
-            old + (part.start + part.stop - size) / 2 * context.pitch_um
-            for old, part, size in zip(context.field_centre_um, area, shape, strict=True)
-        )
         context = replace(
-            context,
-            layout_um=context.layout_um[..., rows, columns],
-            field_centre_um=(y_um, x_um),
-            field_radius_um=context.radius_um(),
+            self.context,
+            layout_um=self.context.layout_um[..., rows, columns],
             scan_shape=shape,
             origin_px=(rows.start, columns.start),
         )
