@@ -32,6 +32,8 @@ _KEPT_BYTES = 512 * 2**20
 # Indices of the features whose strength may depend on the writing order or the dose: the height, |∂y| and
 # |∂x| of the layout blurred with σ = 0.3 µm, and the layout blurred with σ = 1.6 µm (the surroundings).
 _VARYING = (18, 21, 22, 7)
+# The strengths of the regularisation that are tried; see ``ridge_squares``.
+_SHRINKINGS = (100.0, 10.0, 1.0, 1e-1, 1e-2, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -94,17 +96,13 @@ class Learner:
         # different values of it.
         facts = np.array([(scan.context.order, scan.context.dose - 1.0) for scan in study.scans])
         varied = facts[:, [len(np.unique(own)) >= 3 for own in facts.T]]
-        self._rows_of = [self._rows(model, *one) for one in zip(study.scans, varied, strict=True)]
-        self._bases = [
-            orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
-            for scan, own in zip(study.scans, predictions, strict=True)
-        ]
-        self._grams = np.stack(
-            [
-                gram(own.T.astype(np.float64), basis) / len(basis)
-                for own, basis in zip(self._rows_of, self._bases, strict=True)
-            ]
-        )
+        # For each scan: its features, the orthonormal basis of its free terms, and the inner products of the
+        # features without the free terms.
+        self._parts = []
+        for scan, own, values in zip(study.scans, predictions, varied, strict=True):
+            rows = self._rows(model, scan, values)
+            basis = orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
+            self._parts.append((rows, basis, gram(rows.T.astype(np.float64), basis) / len(basis)))
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
@@ -114,14 +112,15 @@ class Learner:
             predictions: predicted height of each scan, µm, of shape (ny, nx), by a model that was fitted
                 without the fold of this scan.
         """
-        grams = np.pad(self._grams, [(0, 0), (1, 0), (1, 0)])
-        parts = zip(self._study.scans, predictions, self._rows_of, self._bases, grams, strict=True)
-        for scan, own, rows, basis, products in parts:
+        products = []
+        for scan, own, (rows, basis, inner) in zip(self._study.scans, predictions, self._parts, strict=True):
             residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
-            products[0, 0] = np.mean(residual**2)
-            products[0, 1:] = products[1:, 0] = rows @ residual / len(residual)
-        left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
+            products.append(np.pad(inner, [(1, 0), (1, 0)]))
+            products[-1][0, 0] = np.mean(residual**2)
+            products[-1][0, 1:] = products[-1][1:, 0] = rows @ residual / len(residual)
+        grams = np.stack(products)
+        left = ridge_squares(grams, self._study.fold_of, _SHRINKINGS) * NM_PER_UM**2
         squares = grams[:, 0, 0] * NM_PER_UM**2
         return Rest(squares - left, squares)
 
@@ -145,18 +144,22 @@ class Learner:
         return np.concatenate(columns).astype(np.float32)
 
 
-def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Return the mean squared residual that the ridge regression leaves in each scan. For each scan, the
-    regression is fitted, and its regularisation is chosen, without the scans of the same fold. The result has
-    shape (scans,).
+def ridge_squares(grams: np.ndarray, fold_of: np.ndarray, shrinkings: Sequence[float]) -> np.ndarray:
+    """Return the mean squared residual that a ridge regression on m columns leaves in each scan. For each
+    scan, the regression is fitted, and its regularisation is chosen, without the scans of the same fold. The
+    result has shape (scans,).
+
+    Args:
+        grams: inner products of the residual (index 0) and the columns in each scan, divided by the number of
+            pixels, of shape (scans, 1 + m, 1 + m).
+        fold_of: number of the fold of each scan, of shape (scans,).
+        shrinkings: the strengths of the regularisation from which one is chosen. Each is the weight of the
+            prior that no column is present, stated as a number of scans. If only one scan is left for the
+            fit, the strengths cannot be compared, and the first of them is used.
     """
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
-    # The last argument of ``Block`` is the strength of the regularisation, stated as a number of scans. If
-    # only one scan is left for the fit, the strengths cannot be compared, and the first of them is used.
-    blocks = [
-        Block(tuple(range(1, grams.shape[1])), ALL, shrinking)
-        for shrinking in (100.0, 10.0, 1.0, 1e-1, 1e-2, 1e-3)
-    ]
+    columns = tuple(range(1, grams.shape[1]))
+    blocks = [Block(columns, ALL, shrinking) for shrinking in shrinkings]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]

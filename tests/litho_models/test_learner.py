@@ -135,7 +135,7 @@ def test_rows_are_thinned_where_they_would_not_fit(scene, rest_without, monkeypa
     pixels = sum(len(scan.sample) for scan in study.scans)
     monkeypatch.setattr(module, "_KEPT_BYTES", 4 * 320 * pixels // 2)
     thinned = Learner(study, predictions)
-    assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 320 * pixels // 2
+    assert sum(rows.nbytes for rows, *_ in thinned._parts) <= 4 * 320 * pixels // 2
     # With half of the pixels, the result is nearly the same.
     assert thinned.rest(lacking).mean_nm2 == pytest.approx(rest_without(bead).mean_nm2, rel=0.15)
 
