@@ -42,11 +42,6 @@ class Fit(NamedTuple):
     twin: Twin
     measurement: MeasurementModel
 
-    @property
-    def numbers(self) -> tuple[int, int]:
-        """Return the numbers of fitted parameters of the printer model and of the measurement model."""
-        return len(self.twin.vector), self.measurement.numbers
-
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
         """Return the map that a scan is expected to show, µm, of shape (ny, nx)."""
         return self.measurement.expected_um(scan.stored, self.twin.height(scan))
@@ -139,8 +134,11 @@ class HeldOut:
     """
 
     def __init__(self, study: Study):
-        self.study, self.scans = study, study.stored
-        self._by_fold, self.fit = cache(self._predicted), cache(self._to_all)
+        self.study = study
+        self._rows = partial(error_rows, study.stored, seed=study.seed)
+        self._by_fold = cache(self._predicted)
+        # The fit of a model to all scans of the study.
+        self.fit = cache(lambda state: fit_with_measurement(state.twin, study.scans, study.seed))
 
     def errors(self, closed: Closed) -> list[ErrorRow]:
         """Return the errors of three models of a loop: the base model, the base model with the causes, and
@@ -156,7 +154,7 @@ class HeldOut:
         rows = self._rows(maps, (numbers, 0), model="base", measurement="print alone")
         if not study.of_films:
             # A smooth background has five coefficients.
-            maps = self._published(plain, maps)
+            maps = [*map(np.add, maps, self._backgrounds_um(plain))]
             rows += self._rows(maps, (numbers, 5), model="base", measurement="published")
         for name, state in {"base": closed.base, "causes": causes, **closed.ends}.items():
             if name != "causes" or causes not in closed.ends.values():
@@ -195,12 +193,6 @@ class HeldOut:
             found[name] = error_nm(model.without(name)) - error_nm(model)
         return found
 
-    def _rows(self, maps: Maps, numbers: tuple[int, int], **terms: str) -> list[ErrorRow]:
-        return error_rows(self.scans, maps, numbers, self.study.seed, **terms)
-
-    def _to_all(self, state: State) -> Fit:
-        return fit_with_measurement(state.twin, self.study.scans, self.study.seed)
-
     def _predicted(
         self, state: State, refit: bool = True, by: Parts = "folds"
     ) -> tuple[Maps, tuple[int, int]]:
@@ -219,22 +211,19 @@ class HeldOut:
             partial(fit_with_measurement, twin, [study.scans[i] for i in rest], study.seed, refit)
             for twin, (rest, _) in zip(starts, study.folds, strict=True)
         ]
-        done = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}"))
-        fits = [done[job] for job in jobs]
-        maps = [fits[at].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
-        return maps, (len(state.twin.vector), max(fit.measurement.numbers for fit in fits))
+        fits = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}"))
+        maps = [fits[jobs[at]].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
+        return maps, (len(state.twin.vector), max(fit.measurement.numbers for fit in fits.values()))
 
-    def _published(self, plain: State, maps: Maps) -> Maps:
-        """Add to each predicted map a smooth background, which is learned from the scans of the other folds.
-        The benchmark predicts measured maps in the same way.
+    def _backgrounds_um(self, plain: State) -> Maps:
+        """Return the smooth background on each scan, µm, of shape (ny, nx). It is learned from the scans of
+        the other folds, as in the benchmark.
         """
-        found, scans = list(maps), self.study.scans
-        for twin, (rest, own) in zip(plain.per_fold, self.study.folds, strict=True):
-            known = [scans[i] for i in rest]
-            learned = learn_background([scan.stored for scan in known], [*map(twin.height, known)])
-            for i in own:
-                found[i] = maps[i] + learned.of_scan(scans[i].stored)
-        return found
+        study, learned = self.study, []
+        for twin, (rest, _) in zip(plain.per_fold, study.folds, strict=True):
+            known = [study.scans[i] for i in rest]
+            learned.append(learn_background([scan.stored for scan in known], [*map(twin.height, known)]))
+        return [learned[at].of_scan(scan) for scan, at in zip(study.stored, study.fold_of, strict=True)]
 
 
 def errors_of_others(
@@ -252,18 +241,16 @@ def errors_of_others(
         held_out: a word that states what was held out; see ``ErrorRow.held_out``.
         seed: seed of the calibration blocks.
     """
-    maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
-    numbers = dict.fromkeys(maps, (0, 0))
+    fits: dict[Stage, dict[str, tuple[PreparedScan, Fit]]] = {"base": {}, "all": {}}
     for models, closed, out in found:
-        prepared = prepare_scans(out, models.study.scans)
-        for stage, state in closed.ends.items():
-            fit = models.fit(state)
-            maps[stage] |= {scan.id: fit.expected_um(scan) for scan in prepared}
-            numbers[stage] = max(fit.numbers, numbers[stage])
+        for scan in prepare_scans(out, models.study.scans):
+            for stage, state in closed.ends.items():
+                fits[stage][scan.id] = scan, models.fit(state)
     rows = []
-    for stage, own in maps.items():
-        expected = [own[scan.id] for scan in scans]
-        rows += error_rows(scans, expected, numbers[stage], seed, model=stage, held_out=held_out)
+    for stage, own in fits.items():
+        maps = [fit.expected_um(scan) for scan, fit in (own[one.id] for one in scans)]
+        numbers = max((len(fit.twin.vector), fit.measurement.numbers) for _, fit in own.values())
+        rows += error_rows(scans, maps, numbers, seed, model=stage, held_out=held_out)
     return rows
 
 
@@ -277,11 +264,10 @@ def nested_errors(
     folds = parted(study, nested).folds
 
     def anew() -> Iterator[tuple[HeldOut, Closed, list[PrintedScan]]]:
-        for number in progress(range(len(folds)), "repeating all choices"):
-            rest, own = folds[number]
+        for number, (rest, own) in enumerate(progress(folds, "repeating all choices"), 1):
             out = [scans[i] for i in own]
             names = ", ".join(scan.id for scan in out)
-            study.report(f"leaving out {names} and repeating all choices ({number + 1} of {len(folds)})")
+            study.report(f"leaving out {names} and repeating all choices ({number} of {len(folds)})")
             closed = close_again([scans[i] for i in rest])
             yield HeldOut(closed.given), closed, out
 
