@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import find_objects, label
+from scipy.ndimage import label
 from scipy.stats import median_abs_deviation
+from skimage.measure import regionprops
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
@@ -51,10 +52,15 @@ def rounding_step_um(raw_height_um: np.ndarray) -> float:
     return step if np.mean(np.abs(places - np.round(places)) < 0.05) >= 0.99 else 0.0
 
 
-def rounding(steps_um: Sequence[float]) -> ScanFinding:
+def rounding(steps_um: Sequence[float]) -> list[ScanFinding]:
     """Report the rounding of the heights in the raw files. Rounding adds uniformly distributed noise, whose
-    rms is the step divided by √12.
+    rms is the step divided by √12. Without raw files, there is no finding.
+
+    Args:
+        steps_um: rounding step of each scan, as ``rounding_um`` returns it.
     """
+    if not steps_um:
+        return []
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = rms(steps_nm) / 12**0.5, steps_nm[steps_nm > 0]
     evidence = "the heights in the raw files are not multiples of a common step"
@@ -64,7 +70,7 @@ def rounding(steps_um: Sequence[float]) -> ScanFinding:
             f"{np.median(rounded):.3g} nm; this rounding adds noise of {noise_nm:.2g} nm rms"
         )
     name, seen = "quantisation", noise_nm >= _SMALLEST_RMS_NM
-    return ScanFinding(name=name, title=name, role="measurement", seen=seen, evidence=evidence)
+    return [ScanFinding(name=name, title=name, role="measurement", seen=seen, evidence=evidence)]
 
 
 def scars(scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]) -> ScanFinding:
@@ -81,21 +87,20 @@ def scars(scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]) -> ScanF
     return ScanFinding(name=name, title=name, role="measurement", seen=seen, evidence=text, p=p)
 
 
-def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> tuple[int, int]:
+def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> np.ndarray:
     """Return the number of outliers that are elongated along the scan lines, and the number of outliers that
-    are elongated across the scan lines. An outlier is a connected patch of pixels with large residuals.
+    are elongated across the scan lines, of shape (2,). An outlier is a connected patch of pixels with large
+    residuals.
     """
     residual_um = freed_um(scan.stored.height_um, map_um, scan.usable, POLICIES["full"])
     spread = median_abs_deviation(residual_um[scan.usable], scale=1 / 1.4826)
     numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
-    sizes = np.bincount(numbered.ravel())[1:]
-    boxes = [[part.stop - part.start for part in box] for box in find_objects(numbered)]
     # Patches with fewer than nine pixels count as noise. A patch counts as elongated if it is at least four
     # times as long as wide.
-    sides = np.reshape(boxes, (-1, 2))[sizes >= 9]
+    sides = np.reshape([one.image.shape for one in regionprops(numbered) if one.area >= 9], (-1, 2))
     # The numbers of patches that are elongated along y and along x.
     counts, axis = (sides >= 4 * sides[:, ::-1]).sum(axis=0), axis_along(scan.line)
-    return int(counts[axis]), int(counts[1 - axis])
+    return counts[[axis, 1 - axis]]
 
 
 def with_bends(finding: ScanFinding, scans: Sequence[PreparedScan]) -> ScanFinding:

@@ -18,7 +18,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import get_effect
 from litho_models.loop.fits import Study
 from litho_models.loop.judging import CONFIRM_P, GROUPED_P, Judgement, evidence_nm2, judge
-from litho_models.loop.marks import rounding, scars, with_bends
+from litho_models.loop.marks import scars, with_bends
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ScanFinding, Strength
 from litho_models.scan_terms import (
@@ -44,18 +44,16 @@ class SingleScans:
         study: the original scans with their folds, and the seed.
         maps_um: map that each scan is expected to show, µm, of shape (ny, nx). It is predicted by a model of
             the printer and a measurement model, both of which were fitted without this scan.
-        steps_um: rounding step of the heights in the raw file of each scan, as ``rounding_um`` returns it. If
-            it is empty, there is no finding about rounding.
     """
 
-    def __init__(self, study: Study, maps_um: Sequence[np.ndarray], steps_um: Sequence[float] = ()):
-        self.study, self.scans, self.maps_um, self.steps_um = study, study.scans, maps_um, steps_um
+    def __init__(self, study: Study, maps_um: Sequence[np.ndarray]):
+        self.study, self.scans, self.maps_um = study, study.scans, maps_um
         # Each test needs two sets of residuals, and one of them is needed again by the next test.
         self._freed_um = lru_cache(maxsize=2)(self._without)
         self._profiled = cache(self._with_profile)
 
     def findings(self) -> list[ScanFinding]:
-        """Test all per-scan effects, one after the other, and return the findings about them and about marks.
+        """Test all per-scan effects, one after the other, and return the findings about them and about scars.
         In each test, the terms of all effects that were found in earlier tests are fitted, too. Line offsets
         are tested last.
         """
@@ -70,8 +68,7 @@ class SingleScans:
             if found[-1].seen:
                 accepted |= own
         found = [with_bends(one, self.scans) if one.name == "registration-residual" else one for one in found]
-        found += [*self._of_lines(lines, accepted | {"bow"}), scars(self.scans, self.maps_um)]
-        return [*found, rounding(self.steps_um)] if self.steps_um else found
+        return [*found, *self._of_lines(lines, accepted | {"bow"}), scars(self.scans, self.maps_um)]
 
     def _without(self, terms: Terms, axis: int | None) -> list[np.ndarray]:
         """Fit terms to each scan and return the residuals, µm. If ``axis`` is given, the mean profile of the

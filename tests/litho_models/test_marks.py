@@ -42,11 +42,13 @@ def test_heights_that_were_not_rounded_have_no_step() -> None:
 
 def test_rounding_counts_by_the_noise_it_adds() -> None:
     # Rounding to steps of q adds a variance of q² / 12.
-    coarse = rounding([0.012 * np.sqrt(12)] * 2)
+    coarse, fine, none = (rounding([step_um * np.sqrt(12)] * 2)[0] for step_um in (0.012, 0.0001, 0.0))
     assert coarse.seen
     assert "12 nm rms" in coarse.evidence
-    assert not rounding([0.0001 * np.sqrt(12)] * 2).seen
-    assert not rounding([0.0, 0.0]).seen
+    assert not fine.seen
+    assert not none.seen
+    # Without raw files, nothing is said about rounding.
+    assert rounding([]) == []
 
 
 @pytest.mark.parametrize("turned", [False, True])

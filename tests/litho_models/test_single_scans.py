@@ -78,7 +78,6 @@ def stripes(size_um: float, *, written: bool = False) -> Change:
 def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
     found = found_with(nothing, SMALL_PX)
     assert seen(found) == {"datum-offset"}
-    # Without raw files, nothing is said about rounding.
     assert set(found) == {term.effect for term in SCAN_TERMS.values() if term.effect} | {"scars-and-spikes"}
     spread = found["datum-offset"].spread["offset_um"]
     # Compute the drawn datums. The offset of the base is the same for all scans.
@@ -189,11 +188,6 @@ def test_marks_are_listed_beside_the_terms() -> None:
     maps = truths(study.scans)
     bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (SMALL_PX, SMALL_PX), (0.1, 0.1))
     bent = [replace(one, stored=replace(one.stored, bend_um=bend)) for one in study.scans]
-    plain, rounded = (
-        {one.name: one for one in SingleScans(replace(study, scans=bent), maps, steps).findings()}
-        for steps in ([], [0.01] * len(bent))
-    )
-    assert rounded.keys() - plain.keys() == {"quantisation"}
-    assert "10 nm" in rounded["quantisation"].evidence
-    assert "scars-and-spikes" in plain
-    assert f"straightened {len(bent)} of {len(bent)} scans" in plain["registration-residual"].evidence
+    found = {one.name: one for one in SingleScans(replace(study, scans=bent), maps).findings()}
+    assert "scars-and-spikes" in found
+    assert f"straightened {len(bent)} of {len(bent)} scans" in found["registration-residual"].evidence
