@@ -4,7 +4,7 @@ and a measurement model (of the microscope) is fitted together with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from operator import call
@@ -32,6 +32,9 @@ from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
 Maps = list[np.ndarray]
+# Predicted maps of several scans, and the numbers of fitted parameters of the printer model and of the
+# measurement model.
+Predicted = tuple[Maps, tuple[int, int]]
 # The parts of a study that are left out one after the other.
 Parts = Literal["folds", "prints"]
 
@@ -173,6 +176,17 @@ class HeldOut:
         """
         return self._by_fold(state)[0]
 
+    def of_others(self, closed: Closed, scans: Sequence[PrintedScan]) -> dict[Stage, Predicted]:
+        """Predict scans that do not belong to the study, with the base model and with the corrected model.
+        Both models are fitted to all scans of the study. The result is keyed by the stage of the loop.
+        """
+        prepared, found = prepare_scans(scans, self.study.scans), dict[Stage, Predicted]()
+        for stage, state in closed.ends.items():
+            fit = self.fit(state)
+            numbers = len(fit.twin.vector), fit.measurement.numbers
+            found[stage] = [*map(fit.expected_um, prepared)], numbers
+        return found
+
     def left_out_nm(self, closed: Closed) -> dict[str, float]:
         """Return the increase of the headline error (see ``ErrorRow.is_headline``), nm, when an effect is
         removed from the corrected model and the model is refitted. The result is keyed by the name of the
@@ -193,9 +207,7 @@ class HeldOut:
             found[name] = error_nm(model.without(name)) - error_nm(model)
         return found
 
-    def _predicted(
-        self, state: State, refit: bool = True, by: Parts = "folds"
-    ) -> tuple[Maps, tuple[int, int]]:
+    def _predicted(self, state: State, refit: bool = True, by: Parts = "folds") -> Predicted:
         """Predict each scan by a fit to the scans outside its fold (or to the scans of all other prints).
         Return the predicted maps, and two numbers of parameters: those of the printer model, and those of the
         measurement model in the fit where they are largest.
@@ -226,49 +238,23 @@ class HeldOut:
         return [learned[at].of_scan(scan) for scan, at in zip(study.stored, study.fold_of, strict=True)]
 
 
-def errors_of_others(
-    found: Iterable[tuple[HeldOut, Closed, Sequence[PrintedScan]]],
-    scans: Sequence[PrintedScan],
-    held_out: str,
-    seed: int,
-) -> list[ErrorRow]:
-    """Return the errors of the base model and of the corrected model on scans that were used neither to
-    choose nor to fit these models.
-
-    Args:
-        found: for each loop, its ``HeldOut`` object, its result, and the scans that it did not use.
-        scans: all scans that are predicted, in the order in which they are reported.
-        held_out: a word that states what was held out; see ``ErrorRow.held_out``.
-        seed: seed of the calibration blocks.
-    """
-    fits: dict[Stage, dict[str, tuple[PreparedScan, Fit]]] = {"base": {}, "all": {}}
-    for models, closed, out in found:
-        for scan in prepare_scans(out, models.study.scans):
-            for stage, state in closed.ends.items():
-                fits[stage][scan.id] = scan, models.fit(state)
-    rows = []
-    for stage, own in fits.items():
-        maps = [fit.expected_um(scan) for scan, fit in (own[one.id] for one in scans)]
-        numbers = max((len(fit.twin.vector), fit.measurement.numbers) for _, fit in own.values())
-        rows += error_rows(scans, maps, numbers, seed, model=stage, held_out=held_out)
-    return rows
-
-
 def nested_errors(
     study: Study, nested: Parts, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
     """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
     print), and score its result on the scans that were left out. Return the errors on all scans.
     """
-    scans = study.stored
-    folds = parted(study, nested).folds
-
-    def anew() -> Iterator[tuple[HeldOut, Closed, list[PrintedScan]]]:
-        for number, (rest, own) in enumerate(progress(folds, "repeating all choices"), 1):
-            out = [scans[i] for i in own]
-            names = ", ".join(scan.id for scan in out)
-            study.report(f"leaving out {names} and repeating all choices ({number} of {len(folds)})")
-            closed = close_again([scans[i] for i in rest])
-            yield HeldOut(closed.given), closed, out
-
-    return errors_of_others(anew(), scans, f"nested {nested}", study.seed)
+    scans, folds, predicted = study.stored, parted(study, nested).folds, []
+    for number, (rest, own) in enumerate(progress(folds, "repeating all choices"), 1):
+        out = [scans[i] for i in own]
+        names = ", ".join(scan.id for scan in out)
+        study.report(f"leaving out {names} and repeating all choices ({number} of {len(folds)})")
+        closed = close_again([scans[i] for i in rest])
+        predicted.append((own, HeldOut(closed.given).of_others(closed, out)))
+    rows = []
+    for stage in predicted[0][1]:
+        maps = dict(pair for own, found in predicted for pair in zip(own, found[stage][0], strict=True))
+        numbers = max(found[stage][1] for _, found in predicted)
+        every = [maps[i] for i in range(len(scans))]
+        rows += error_rows(scans, every, numbers, study.seed, model=stage, held_out=f"nested {nested}")
+    return rows

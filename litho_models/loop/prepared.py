@@ -113,8 +113,7 @@ class PreparedScan:
         sampled = np.zeros(shape, bool)
         sampled[own] = self._inner[own]
         rows, columns = area = tuple(
-            slice(max(part.start - _MARGIN_PX, 0), min(part.stop + _MARGIN_PX, size))
-            for part, size in zip(own, shape, strict=True)
+            slice(max(part.start - _MARGIN_PX, 0), part.stop + _MARGIN_PX) for part in own
         )
         stored = replace(
             self.stored,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t
 
-from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
+from litho_models.effects import UNTESTABLE, get_effect, screened_effects
 from litho_models.effects.effect import Knowledge
 from litho_models.fitting.least_squares import Linearised, eliminated
 from litho_models.loop.closing import Closed
@@ -206,7 +206,7 @@ def _candidates(
     sets = {other: one.name for one in added for other in one.confusable_with}
     excluded = {other: one.name for one in closed.traced for other in one.excluded}
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
-    tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
+    tried = [one.name for one in screened_effects() if one.of_films == films]
     told = {*(one.name for one in added), *(one.name for one in single_scans)}
 
     def refused(name: str) -> tuple[CandidateVerdict, str]:

@@ -23,7 +23,7 @@ from litho_models.frozen.card import OUT_OF_FOLD
 from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
-from litho_models.loop.errors import HeldOut, Parts, errors_of_others, nested_errors
+from litho_models.loop.errors import HeldOut, Parts, error_rows, nested_errors
 from litho_models.loop.fits import Study
 from litho_models.loop.marks import rounding, rounding_um
 from litho_models.loop.model import FoldedBase
@@ -143,7 +143,8 @@ def close_loop(
             chosen = {closed.base_name: bases[closed.base_name]}
             errors += nested_errors(study, nested, partial(close_again, among=chosen))
         if open_lock_box and locked:
-            errors += errors_of_others([(models, closed, locked)], locked, "locked", seed)
+            for stage, predicted in models.of_others(closed, locked).items():
+                errors += error_rows(locked, *predicted, seed, model=stage, held_out="locked")
         planted = [plant(*one, closed, close_again) for one in wanted]
         result = record(
             closed,

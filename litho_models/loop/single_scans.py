@@ -9,7 +9,7 @@ the residual of the other half.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -50,7 +50,6 @@ class SingleScans:
         self.study, self.scans, self.maps_um = study, study.scans, maps_um
         # Each test needs two sets of residuals, and one of them is needed again by the next test.
         self._freed_um = lru_cache(maxsize=2)(self._without)
-        self._profiled = cache(self._with_profile)
 
     def findings(self) -> list[ScanFinding]:
         """Test all per-scan effects, one after the other, and return the findings about them and about scars.
@@ -70,18 +69,15 @@ class SingleScans:
         found = [with_bends(one, self.scans) if one.name == "registration-residual" else one for one in found]
         return [*found, *self._of_lines(lines, accepted | {"bow"}), scars(self.scans, self.maps_um)]
 
-    def _without(self, terms: Terms, axis: int | None) -> list[np.ndarray]:
-        """Fit terms to each scan and return the residuals, µm. If ``axis`` is given, the mean profile of the
-        scans of other folds is subtracted first; see ``_with_profile``.
-        """
-        maps = self.maps_um if axis is None else self._profiled(axis)
+    def _without(self, terms: Terms) -> list[np.ndarray]:
+        """Fit terms to each scan and return the residuals, µm."""
         blocks = Blocks(seed=self.study.seed)
         return [
             cross_fit(scan.stored.height_um, own, scan.usable, terms, blocks, scan_line=scan.line).residual_um
-            for scan, own in zip(self.scans, maps, strict=True)
+            for scan, own in zip(self.scans, self.maps_um, strict=True)
         ]
 
-    def _judged(self, before: Terms, after: Terms, axis: int | None = None) -> Judgement:
+    def _judged(self, before: Terms, after: Terms) -> Judgement:
         """Judge per-scan terms by whether the two halves of each scan agree on them.
 
         The number of scans with a smaller error would not be a suitable test: in a scan whose term is near
@@ -89,9 +85,8 @@ class SingleScans:
 
         Args:
             before, after: the terms that are fitted without and with those that are judged.
-            axis: as for ``_without``.
         """
-        left_um = [self._freed_um(terms, axis) for terms in (before, after)]
+        left_um = [self._freed_um(terms) for terms in (before, after)]
         was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in left_um)
         return judge(was, now, self.study, np.array([*map(evidence_nm2, *left_um)]))
 
@@ -100,7 +95,7 @@ class SingleScans:
         found in earlier tests, and ``after`` also contains the terms of this effect.
         """
         effect, judgement = get_effect(name), self._judged(before, after)
-        reason, gain_nm2 = judgement.reason(), judgement.gain_nm2
+        reason = judgement.reason()
         values = coefficients(self.scans, self.maps_um, terms_of_effect(name), after)
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
         # If the term agrees between the scans of one print, the printer may be its cause instead of the
@@ -108,7 +103,7 @@ class SingleScans:
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spreads = zip(effect.parameters.items(), values.std(axis=0, ddof=1).tolist(), strict=True)
         few, many = (len(parameter_names(terms)) for terms in (before, after))
-        was, now = np.sqrt([judgement.before_nm2, judgement.before_nm2 - gain_nm2])
+        was, now = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
         told = (
             f"if the number of terms per scan rises from {few} to {many}, the RMSE on "
             f"pixels outside the fit changes from {was:.2f} to {now:.2f} nm"
@@ -133,8 +128,10 @@ class SingleScans:
         lines come from the microscope. If no scan were rotated, the two kinds of offsets could not be
         distinguished.
         """
-        judged = {name: self._judged(accepted, accepted | terms_of_effect(name), axis=1) for name in names}
-        columns = self._judged(accepted, accepted | {"layout-columns"}, axis=0).gains_nm2
+        # Profiles that all scans share are no offsets of the lines of single scans.
+        along_y, along_x = (SingleScans(self.study, self._with_profile(axis)) for axis in (0, 1))
+        judged = {name: along_x._judged(accepted, accepted | terms_of_effect(name)) for name in names}
+        columns = along_y._judged(accepted, accepted | {"layout-columns"}).gains_nm2
         frames = {name: line_terms(terms_of_effect(name))[0].frame for name in names}
         found: list[ScanFinding] = []
         for name, other in permutations(names):
