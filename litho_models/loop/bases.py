@@ -32,6 +32,8 @@ AUTO = "auto"
 # Base models from which the loop chooses one by default. The first of them has the same form as the Physics
 # model of the paper.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
+# Settings of base models that differ from the defaults of these models.
+_USUAL = {"physics": {"spot": "round"}}
 
 
 def bases_for(
@@ -91,8 +93,7 @@ def bases_for(
 
 
 def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simulator:
-    usual: dict[str, Any] = {"spot": "round"} if name == "physics" else {}
-    return build_model(name, **common_geometry([scan]), **{**usual, **fields})
+    return build_model(name, **common_geometry([scan]), **{**_USUAL.get(name, {}), **fields})
 
 
 def _frozen(base: str, pitch_um: float, store: Store | None) -> dict[str, nn.Module]:

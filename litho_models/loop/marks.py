@@ -27,16 +27,6 @@ from litho_models.scoring.statistics import one_sided_flip_p, rms
 _SMALLEST_RMS_NM = 0.5
 
 
-def rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the rounding step of the heights in the raw file of each scan, µm. The list is empty if the
-    store has no raw files.
-    """
-    try:
-        return [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
-    except InputError:
-        return []
-
-
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
     """Return the rounding step of the heights of a raw scan, µm. Apart from a common offset, all heights are
     multiples of this step. Return 0 if there is no such step.
@@ -52,14 +42,13 @@ def rounding_step_um(raw_height_um: np.ndarray) -> float:
     return step if np.mean(np.abs(places - np.round(places)) < 0.05) >= 0.99 else 0.0
 
 
-def rounding(steps_um: Sequence[float]) -> list[ScanFinding]:
+def rounding(store: Store, scans: Sequence[PrintedScan]) -> list[ScanFinding]:
     """Report the rounding of the heights in the raw files. Rounding adds uniformly distributed noise, whose
-    rms is the step divided by √12. Without raw files, there is no finding.
-
-    Args:
-        steps_um: rounding step of each scan, as ``rounding_um`` returns it.
+    rms is the step divided by √12. If the store has no raw files, there is no finding.
     """
-    if not steps_um:
+    try:
+        steps_um = [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
+    except InputError:
         return []
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = rms(steps_nm) / 12**0.5, steps_nm[steps_nm > 0]

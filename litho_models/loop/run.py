@@ -25,7 +25,7 @@ from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, error_rows, nested_errors
 from litho_models.loop.fits import Study
-from litho_models.loop.marks import rounding, rounding_um
+from litho_models.loop.marks import rounding
 from litho_models.loop.model import FoldedBase
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ScanFinding
@@ -136,7 +136,7 @@ def close_loop(
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
             alone = SingleScans(study, models.maps_um(closed.final)).findings()
-            alone += rounding(rounding_um(opened, development))
+            alone += rounding(opened, development)
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
         errors, left_out_nm = models.errors(closed), models.left_out_nm(closed)
         if nested:

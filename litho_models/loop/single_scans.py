@@ -63,10 +63,10 @@ class SingleScans:
             if line_terms(own):
                 lines.append(name)
                 continue
-            found.append(self._of_terms(name, accepted - own, accepted | own))
-            if found[-1].seen:
+            one = self._of_terms(name, accepted - own, accepted | own)
+            found.append(with_bends(one, self.scans) if name == "registration-residual" else one)
+            if one.seen:
                 accepted |= own
-        found = [with_bends(one, self.scans) if one.name == "registration-residual" else one for one in found]
         return [*found, *self._of_lines(lines, accepted | {"bow"}), scars(self.scans, self.maps_um)]
 
     def _without(self, terms: Terms) -> list[np.ndarray]:

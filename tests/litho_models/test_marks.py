@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from litho_data.register.bend import Bend
-from litho_data.store import PrintedScan
+from litho_data.store import PrintedScan, Store, open_store
 from litho_models.loop.marks import rounding, rounding_step_um, scars, with_bends
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import ScanFinding
 from tests.litho_models.loop_scans import blank_scans, with_heights
+from tests.litho_models.prints import write_store
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
 # The transform of a scan that is rotated by 90°, so that its lines lie along y.
@@ -41,14 +45,23 @@ def test_heights_that_were_not_rounded_have_no_step() -> None:
 
 
 def test_rounding_counts_by_the_noise_it_adds() -> None:
+    def of(step_um: float) -> ScanFinding:
+        raw = np.round(HEIGHTS / step_um) * step_um if step_um else HEIGHTS
+        store = cast(Store, SimpleNamespace(scan_frame=lambda scan_id, name: raw))
+        [found] = rounding(store, blank_scans(2))
+        return found
+
     # Rounding to steps of q adds a variance of q² / 12.
-    coarse, fine, none = (rounding([step_um * np.sqrt(12)] * 2)[0] for step_um in (0.012, 0.0001, 0.0))
+    coarse, fine, none = (of(step_um * np.sqrt(12)) for step_um in (0.012, 0.0001, 0.0))
     assert coarse.seen
     assert "12 nm rms" in coarse.evidence
     assert not fine.seen
     assert not none.seen
-    # Without raw files, nothing is said about rounding.
-    assert rounding([]) == []
+
+
+def test_without_raw_files_nothing_is_said_about_rounding(tmp_path: Path) -> None:
+    scans = blank_scans(2)
+    assert rounding(open_store(write_store(tmp_path / "s.zarr", scans)), scans) == []
 
 
 @pytest.mark.parametrize("turned", [False, True])
