@@ -103,7 +103,7 @@ def _frozen(base: str, pitch_um: float, store: Store | None) -> dict[str, nn.Mod
         wanted = f"{pitch_um:g} µm, the pitch of the scans"
         raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=wanted)
     model = load_simulator(folder, card)
-    if store and not is_refitted(model) and trained_ids(card.model_dump(), store):
+    if store is not None and not is_refitted(model) and trained_ids(card.model_dump(), store):
         raise InputError(
             f"base {base}",
             got="a model that was trained on scans of this store, so no scan is held out",

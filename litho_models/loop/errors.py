@@ -68,8 +68,10 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int, r
         freed = map(measurement.freed, stored, maps)
         # The number of a scan determines which quadrant its window covers. With consecutive numbers, the
         # windows are distributed evenly over the quadrants.
-        numbered = enumerate(zip(scans, freed, strict=True))
-        windows = [replace(scan, stored=own, number=at).window for at, (scan, own) in numbered]
+        windows = [
+            replace(scan, stored=own, number=at).window
+            for at, (scan, own) in enumerate(zip(scans, freed, strict=True))
+        ]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
         measurement = learn_measurement(stored, [*map(twin.height, scans)], seed=seed, like=measurement)
     # Strengths of groups to which none of these scans belongs were not fitted here. Their values may be from

@@ -108,7 +108,7 @@ class PreparedScan:
         if min(shape) < LARGE_PX:
             return self
         quadrants = [Crop(self.id, number).slices(shape) for number in (0, 2, 1, 3)]
-        counts = [int(np.count_nonzero(self._inner[own])) for own in quadrants]
+        counts = [self._inner[own].sum() for own in quadrants]
         own = quadrants[part_to_fit(counts, self.number % 4)]
         sampled = np.zeros(shape, bool)
         sampled[own] = self._inner[own]
