@@ -1,4 +1,6 @@
-"""Estimate the white noise of a measured map, and the uncertainty of scores that are computed from it."""
+"""Estimate the white noise of a measured map, the covariance of a fit to it, and the uncertainty of its
+scores.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,9 @@ T = TypeVar("T")
 
 # Number of random draws of the noise. With this number of draws, the rms change of a score is known to 25 %.
 DRAWS = 8
+# Number of tiles along each side of a map from which the covariance of a fit is computed. Errors of an
+# expected map are correlated over several features, so a tile must be larger than these.
+_TILES = 4
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
@@ -45,6 +50,33 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
     scale = columns.max(0)
     (dark, share), _ = nnls(columns / scale, np.square(noise).ravel())
     return float(np.sqrt(dark / scale[0])), float(np.sqrt(share / scale[1]))
+
+
+def covariance_by_tiles(slopes: np.ndarray, residual: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return the covariance of a least-squares fit to a map whose residuals are correlated between pixels,
+    shape (k, k).
+
+    The fit is repeated without each tile of the map (jackknife, Efron and Tibshirani 1993, chapter 11). A
+    print that differs from the expected one appears to be displaced by a different amount in each tile. The
+    covariance includes this effect, even if few tiles determine a parameter. It does not include an error
+    that is the same in all tiles.
+
+    Args:
+        slopes: derivatives of the fitted values with respect to the k parameters, shape (n, k).
+        residual: measured minus fitted values, shape (n,).
+        shape: shape (ny, nx) of the map. The first ny * nx residuals are those of its pixels, row by row. Any
+            others express prior knowledge, and belong to no tile.
+    """
+    along = [np.arange(size) * _TILES // size for size in shape]
+    tile = np.full(len(residual), -1)
+    tile[: shape[0] * shape[1]] = (along[0][:, None] * _TILES + along[1]).ravel()
+    normal, right = slopes.T @ slopes, slopes.T @ residual
+    found = []
+    for left_out in range(_TILES**2):
+        part, rest = slopes[tile == left_out], residual[tile == left_out]
+        found.append(np.linalg.pinv(normal - part.T @ part) @ (right - part.T @ rest))
+    spread: np.ndarray = np.cov(np.transpose(found), bias=True) * (_TILES**2 - 1)
+    return spread
 
 
 def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

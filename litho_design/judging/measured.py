@@ -16,9 +16,13 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
+from litho_data.register.flows import GENERATORS, LADDER, flows, normalisation
+from litho_data.register.pyramid import SCAN_BLUR_PX
+from litho_data.register.refine import interior_of
+from litho_data.register.topography import predicted_topography, smooth_measured
 from litho_data.scan import Scan
 from litho_design.images.measurements import Levelling, MeasuredSource
-from litho_design.images.noise import DRAWS, white_noise
+from litho_design.images.noise import DRAWS, covariance_by_tiles, white_noise
 from litho_design.judging.loaded import LoadedDesign
 
 # Smallest share of the element that must be measured. With fewer measured pixels, the score would depend too
@@ -65,9 +69,10 @@ class MeasuredRecord(Record):
     or together with the gain of the expected print (``print``), which also removes tilt and bow of the print
     itself. ``removed_sd_um`` contains the standard deviation of each of these terms (x, y, x², xy, y²).
     ``noise_um`` is the standard deviation of the noise, estimated from spatial frequencies at which prints
-    have no structure. ``position_sd_um`` is the standard deviation of the position of a corner along one
-    axis, and ``scale_sd`` is the relative standard deviation of the height scale. ``defect_share`` is the
-    share of the element that shows dust or scars instead of the print.
+    have no structure. ``warp_errors_um`` contains six independent errors of the registration, each as large
+    as its standard deviation (see ``_warp_errors_px``); it is empty for an aligned scan. ``scale_sd`` is the
+    relative standard deviation of the height scale. ``defect_share`` is the share of the element that shows
+    dust or scars instead of the print.
     """
 
     name: str
@@ -84,7 +89,7 @@ class MeasuredRecord(Record):
     bow_um: float
     removed_sd_um: list[float]
     noise_um: float
-    position_sd_um: float
+    warp_errors_um: list[list[float]]
     scale_sd: float
     defect_share: float
     tip_um: float
@@ -201,7 +206,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         bow_um=background.bow_um,
         removed_sd_um=bare.sd_um if bare else [_removed_sd_um(complete - expected, expected)] * 5,
         noise_um=white_noise(complete - expected),
-        position_sd_um=placed.position_sd_um,
+        warp_errors_um=(layout.pitch_um * placed.warp_errors_px).tolist(),
         scale_sd=source.scale_sd,
         defect_share=float(defects.mean()),
         tip_um=tip_um,
@@ -270,7 +275,7 @@ def _defects(off_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray) -> 
 class _Placed(NamedTuple):
     """A scan resampled on the pixels of the layout and of ``margin_px`` pixels around it. It contains the
     heights and the mask of measured pixels, both of shape (ny + 2 margin, nx + 2 margin), the orientation, a
-    warning, and the standard deviation of a corner's position along one axis.
+    warning, and the errors of the registration (see ``_warp_errors_px``).
     """
 
     height_um: np.ndarray
@@ -278,7 +283,7 @@ class _Placed(NamedTuple):
     margin_px: int = 0
     orientation: str = "identity"
     warning: str = ""
-    position_sd_um: float = 0.0
+    warp_errors_px: np.ndarray = np.zeros((0, 6))
 
     def inner(self, one: np.ndarray) -> np.ndarray:
         """Return the part of a map that lies on the layout, of shape (ny, nx)."""
@@ -317,9 +322,39 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
         scan.height_um, moved @ found.scan_to_layout, tuple(size + 2 * margin_px for size in level.shape),
         **pitches, bend_um=found.bend_um,
     )  # fmt: skip
-    # ``corner_sd_nm`` combines both axes, so it is divided by sqrt(2) for one axis.
-    position_sd_um = quality.corner_sd_nm / 1000 / math.sqrt(2)
-    return _Placed(height, valid, margin_px, quality.dihedral, quality.warning, position_sd_um)
+    placed = _Placed(height, valid, margin_px, quality.dihedral, quality.warning)
+    topography = predicted_topography(level, quality.blur_um / pitch_um).astype(float)
+    return placed._replace(warp_errors_px=_warp_errors_px(placed.inner(height), topography))
+
+
+def _warp_errors_px(height_um: np.ndarray, topography: np.ndarray) -> np.ndarray:
+    """Return six independent errors of the affine map that registers a scan, one in each row, shape (6, 6).
+
+    Each error is as large as its standard deviation. It consists of the coefficients of the six generators of
+    an affine map (see ``register.flows``), in pixels: a coefficient of 1 displaces the middle of an edge of a
+    square by one pixel. The errors are computed from the deviation of the heights from the topography, the
+    image to which the scan was registered. Gain and a quadratic background are fitted, too.
+
+    Args:
+        height_um: height of the registered scan, shape (ny, nx), NaN where not measured.
+        topography: height of the layout after blurring, in any unit, shape (ny, nx).
+    """
+    shape = topography.shape
+    used = interior_of(shape) & np.isfinite(height_um)
+    height = smooth_measured(height_um, SCAN_BLUR_PX)
+    still = np.dstack([_shapes(shape, (0, 1, 2)), topography])
+    found, *_ = np.linalg.lstsq(still[used], height[used], rcond=None)
+    slope_y, slope_x = np.gradient(found[-1] * topography)
+    scale = normalisation(shape)
+    x, y = (scale[axis, axis] * np.arange(shape[1 - axis]) + scale[axis, 2] for axis in (0, 1))
+    motions = flows(LADDER["affine"], x[None], y[:, None])
+    moved = np.stack([along_x * slope_x + along_y * slope_y for along_x, along_y in motions], axis=-1)
+    slopes = np.where(used[..., None], np.dstack([still, moved]), 0.0)
+    residual = np.where(used, height - still @ found, 0.0)
+    covariance = covariance_by_tiles(slopes.reshape(-1, slopes.shape[-1]), residual.ravel(), shape)
+    variance, ways = np.linalg.eigh(covariance[-6:, -6:])
+    errors: np.ndarray = (ways * np.sqrt(variance.clip(0))).T
+    return errors
 
 
 @dataclass(frozen=True)
@@ -410,8 +445,8 @@ def with_other_fits(
     """Yield pairs of prints of shape (ny, nx), in µm, that the processing of the scan cannot distinguish from
     the measured print. The two prints of a pair differ from the measured print in one quantity: by plus its
     standard deviation in the first, and by minus it in the second. This quantity is a term of the print's own
-    tilt and bow, a factor common to all these terms (unless they were measured on the substrate), a parameter
-    of the affine registration, or the share of ``doubt_um`` that belongs to the print instead of dust.
+    tilt and bow, a factor common to all these terms (unless they were measured on the substrate), an error of
+    the registration, or the share of ``doubt_um`` that belongs to the print instead of dust.
     """
     measured = height_um.double().cpu().numpy()
     removed = _shapes(measured.shape, _FITTED[record.levelling])
@@ -419,10 +454,10 @@ def with_other_fits(
         yield from _pair(sd_um * shape, height_um)
     if removed.size and record.levelled_on == "print":
         yield from _pair(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed), height_um)
-    for step in np.eye(6).reshape(6, 2, 3) if record.position_sd_um else ():
+    for error_um in record.warp_errors_um:
         for sign in (1, -1):
-            corner_px = sign * record.position_sd_um / pitch_um * step
-            yield torch.from_numpy(_displaced(measured, corner_px)).to(height_um)
+            motion_px = sign * np.array(error_um) / pitch_um
+            yield torch.from_numpy(_displaced(measured, motion_px)).to(height_um)
     if doubt_um.any():
         # If none and all of it are equally likely, its standard deviation is one half.
         yield from _pair(0.5 * doubt_um.double().cpu().numpy(), height_um)
@@ -434,19 +469,17 @@ def _pair(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:
         yield height_um + torch.from_numpy(sign * change_um).to(height_um)
 
 
-def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
-    """Displace a print of shape (ny, nx) by an affine map. ``corner_px``, shape (2, 3), contains for each
-    axis a shift and two linear terms. If these numbers are random with the standard deviation s, the corners
-    move by s px (rms) along each axis. The three terms are weighted like the errors of an affine map that is
-    fitted to points spread evenly over a square. The errors of such a fit displace the edges of the square by
-    a shift and by two linear terms, whose variances are in the ratio 1 : 3 : 3.
+def _displaced(height_um: np.ndarray, motion_px: np.ndarray) -> np.ndarray:
+    """Return a print of shape (ny, nx) whose height at each pixel is that of the given print at a displaced
+    position. ``motion_px`` contains six coefficients of an affine map (see ``_warp_errors_px``).
     """
     from scipy.ndimage import affine_transform
 
-    middle = (np.array(height_um.shape) - 1) / 2
-    part = corner_px * np.sqrt([1 / 7, 3 / 7, 3 / 7])
-    matrix = np.eye(2) + part[:, 1:] / middle
-    offset = part[:, 0] + middle - matrix @ middle
+    ny, nx = height_um.shape
+    motion = np.tensordot(motion_px, GENERATORS[: LADDER["affine"]], 1)
+    # The third coordinate, 1, comes last, and scipy's coordinates are (y, x).
+    to_place = np.eye(3) + motion @ normalisation((ny, nx))
+    matrix, offset = to_place[1::-1, 1::-1], to_place[1::-1, 2]
     found: np.ndarray = affine_transform(height_um, matrix, offset, order=3, mode="nearest")
     return found
 

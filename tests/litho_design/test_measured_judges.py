@@ -16,7 +16,7 @@ from litho_data.foundation.results import Record
 from litho_data.readers import read_scan
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.measurements import MeasuredSource, PhotoSource
-from litho_design.images.noise import estimated
+from litho_design.images.noise import covariance_by_tiles, estimated
 from litho_design.images.photograph import (
     CameraRecord,
     Photograph,
@@ -37,6 +37,7 @@ from litho_design.judging.measured import (
     _Placed,
     _removed_sd_um,
     _shapes,
+    _warp_errors_px,
     _without_tip,
     fitted_background,
     substrate_background,
@@ -399,19 +400,79 @@ def test_dust_is_masked_and_what_the_printer_does_to_all_tall_places_is_not():
     assert _defects(noise_um + np.where(alone_um == 1, 0.4, 0), alone_um, valid)[70, 40]
 
 
-def test_the_steps_of_an_affine_map_add_up_to_the_standard_deviation_at_the_corners():
+def test_the_angle_of_few_spots_is_as_uncertain_as_fits_scatter():
+    """Check fits of shift and rotation to five spots, each of which is displaced at random.
+
+    The spots have the same gradients, so the fit is that of the displacements d of points p: the variance of
+    the angle is s² / Σ|p - mean p|². Five points and three parameters leave seven degrees of freedom, and a
+    fit without one point has five, so the jackknife may overestimate the variance by up to 10 / 5.
+    """
+    rng, y, x = np.random.default_rng(0), *np.mgrid[:64, :64]
+    middles = np.array([(8, 24), (24, 56), (40, 8), (56, 40), (8, 56)]) - 0.5
+    spots = [np.exp(-((y - row) ** 2 + (x - column) ** 2) / 2 / 2**2) for row, column in middles]
+    gradients = np.array([np.gradient(spot) for spot in spots])
+    along_y, along_x = gradients.sum(0)
+    slopes = np.stack([along_x, along_y, (x - 31.5) * along_y - (y - 31.5) * along_x], axis=-1).reshape(-1, 3)
+    angles, stated = [], []
+    for _ in range(200):
+        seen = np.einsum("pi,piyx->yx", 0.1 * rng.standard_normal((5, 2)), gradients).ravel()
+        fitted, *_ = np.linalg.lstsq(slopes, seen, rcond=None)
+        angles.append(fitted[2])
+        stated.append(covariance_by_tiles(slopes, seen - slopes @ fitted, (64, 64))[2, 2])
+    variance = 0.1**2 / np.square(middles - middles.mean(0)).sum()
+    # The variance of 200 angles is known to 10 %, and neighbouring spots barely overlap.
+    assert np.var(angles) == pytest.approx(variance, rel=0.3)
+    assert 0.9 * variance < np.mean(stated) < 2 * variance
+
+
+def test_each_parameter_of_the_registration_is_as_uncertain_as_fits_scatter():
+    """Check the errors of registering bars along y with few notches, in rough scans.
+
+    The bars determine the shift along x much better than that along y. The scatter is that of fits of the
+    same six parameters, gain and background to 60 scans, so each standard deviation is known to 9 %.
+    """
+    rng, (y, x) = np.random.default_rng(3), np.mgrid[:128, :128]
+    bars = np.sign(np.sin(2 * np.pi * x / 32 + 1)) * np.where(rng.random((16, 1)) < 0.3, 0.4, 1).repeat(8, 0)
+    topography = cv2.GaussianBlur(bars, (0, 0), 2.0)
+    u, v = (x - 63.5) / 63.5, (y - 63.5) / 63.5
+    slope_y, slope_x = np.gradient(topography)
+    flows = [(1, 0), (0, 1), (-v, u), (u, v), (u, -v), (v, u)]
+    moved = [along_x * slope_x + along_y * slope_y for along_x, along_y in flows]
+    columns = np.stack([*np.moveaxis(_shapes((128, 128), (0, 1, 2)), -1, 0), topography, *moved], axis=-1)
+    inside = (slice(8, -8), slice(8, -8))
+    found, stated = [], []
+    for _ in range(60):
+        rough = cv2.GaussianBlur(rng.standard_normal((128, 128)), (0, 0), 2.0)
+        height = topography + 0.1 * rough / rough.std()
+        smooth = cv2.GaussianBlur(height, (0, 0), 1.0)
+        fitted, *_ = np.linalg.lstsq(columns[inside].reshape(-1, 13), smooth[inside].ravel(), rcond=None)
+        found.append(fitted[-6:] / fitted[-7])
+        stated.append(np.square(_warp_errors_px(height, topography)).sum(0))
+    scatter, sd = np.std(found, axis=0), np.sqrt(np.mean(stated, axis=0))
+    assert scatter[1] > 3 * scatter[0]
+    # The scatter of 60 fits is known to 9 %, and three times this is allowed. On average, a jackknife does
+    # not underestimate a variance, but it may overestimate it if tiles differ in what they determine.
+    assert (sd / scatter > 1 - 3 * 0.09).all()
+    assert (sd / scatter < 1.5).all()
+
+
+def test_an_error_of_the_registration_displaces_a_print_by_its_coefficients():
     y, x = np.mgrid[:65, :81].astype(float)
-    for heights in (y, x):
-        moved = [_displaced(heights, 0.5 * step) - heights for step in np.eye(6).reshape(6, 2, 3)]
-        # Halfway to a corner, the two linear terms have half their amount.
-        wanted = 0.5**2 * (1 + 3 / 4 + 3 / 4) / 7
-        assert sum(one[16, 60] ** 2 for one in moved) == pytest.approx(wanted, rel=1e-6)
+    coefficients = np.array([0.5, -0.3, 0.2, 0.1, -0.4, 0.6])
+    u, v = (60 - 40) / 40, (16 - 32) / 40
+    shift_x, shift_y, turn, size, stretch, slant = coefficients
+    motions = (
+        shift_x - turn * v + (size + stretch) * u + slant * v,
+        (shift_y + turn * u + (size - stretch) * v + slant * u),
+    )
+    for heights, wanted in zip((x, y), motions, strict=True):
+        assert (_displaced(heights, coefficients) - heights)[16, 60] == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize(("levelling", "terms"), [("none", 0), ("plane", 2), ("bow", 5)])
 def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     height_um = torch.linspace(0, 0.8, 96).repeat(64, 1)
-    facts = {"levelled_on": "print", "position_sd_um": 0.05, "scale_sd": 0.02, "tip_um": 0.0}
+    facts = {"levelled_on": "print", "scale_sd": 0.02, "tip_um": 0.0, "warp_errors_um": 0.05 * np.eye(6)}
     removed_sd_um = [0.01, 0.02, 0.03, 0.04, 0.05]
     record = MeasuredRecord.model_construct(levelling=levelling, removed_sd_um=removed_sd_um, **facts)
     doubt_um = torch.zeros_like(height_um)
@@ -432,10 +493,10 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     rms_um = plus[:terms].square().mean((1, 2)).sqrt().tolist()
     # On pixels, the terms have an rms of up to 1.04.
     assert rms_um == pytest.approx(removed_sd_um[:terms], rel=0.04)
-    # The first parameter of the registration moves the ramp along y, the fourth along x.
-    slope, shift_px = 0.8 / 95, 0.05 / 0.1 / np.sqrt(7)
-    assert plus[-6][inside[1:]].abs().max() == pytest.approx(0, abs=1e-6)
-    assert plus[-3][inside[1:]].numpy() == pytest.approx(slope * shift_px, rel=1e-3)
+    # The first error of the registration moves the ramp along x, the second along y.
+    slope, shift_px = 0.8 / 95, 0.05 / 0.1
+    assert plus[-6][inside[1:]].numpy() == pytest.approx(slope * shift_px, rel=1e-3)
+    assert plus[-5][inside[1:]].abs().max() == pytest.approx(0, abs=1e-6)
     (more, less) = with_other_scale(height_um, record, 0.1)
     assert torch.allclose(more, 1.02 * height_um)
     assert torch.allclose(more + less, 2 * height_um)
