@@ -17,7 +17,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
 from litho_design.images.measurements import PhotoSource
-from litho_design.images.noise import DRAWS, noise_of_light
+from litho_design.images.noise import DRAWS, covariance_by_tiles, noise_of_light
 from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
@@ -36,23 +36,14 @@ _SMALLEST_COVERAGE = 0.9
 # Standard deviation of the relative loss of light in the corners of a photograph, which depends on the
 # objective.
 _VIGNETTING_SD = 0.1
-# A fitted tilt is accepted if the unexplained variance is less than this share of the unexplained variance
-# without a tilt.
-_NEEDED = 0.93
-# A fitted tilt counts as real if its chi squared exceeds this limit. Random errors exceed 13.8 with a
-# probability of 0.1 % (two degrees of freedom).
-_TILT_SURE = 13.8
 # Relative standard deviation of the image size between the prints that different models of the same printer
-# predict (rms over three holograms and five models). A photograph cannot determine its scale more accurately
-# than this.
+# predict (rms over three holograms and five models). It is also the standard deviation of the tilts of these
+# images (0.013, rms over five holograms and five models). A print may scale or tilt its whole image, and the
+# scatter between the tiles of a photograph does not show it.
 _PRINT_SCALE_SD = 0.015
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
 _TILT_SD = 0.1
-# Number of tiles along each side of the window. Residuals are correlated over longer distances than a tile,
-# so the standard deviations that are computed from tiles are multiplied by ``_BEYOND_TILES`` (found with
-# ``benchmarks.coverage``).
-_TILES, _BEYOND_TILES = 6, 1.4
 # Orientations are compared on images with about this side, px; correlations that differ by less than ``_TIE``
 # are a tie.
 _SMALL_PX = 192
@@ -147,9 +138,6 @@ class Photograph:
         other_warps: pairs of maps like ``window_to_photo``, one pair for each independent movement of the
             camera in the fit. In the two maps, the camera is moved by plus and minus the standard deviation
             of this movement.
-        other_tilts: two such pairs of maps, for two independent tilts of the camera; empty if a tilt was
-            fitted. A tilt that is too small to be fitted may come from the camera or from the print. Half of
-            its variance is therefore counted in ``with_other_faults`` and half in ``with_other_fits``.
     """
 
     counts: np.ndarray
@@ -161,7 +149,6 @@ class Photograph:
     record: CameraRecord
     expected: np.ndarray
     other_warps: list[list[np.ndarray]]
-    other_tilts: list[list[np.ndarray]]
 
     def image(self) -> np.ndarray:
         """Return the photograph resampled on the pixels of the window, shape (m, m), in counts per camera
@@ -188,21 +175,17 @@ class Photograph:
                 yield self._warped((self.counts + sign * noise).astype(np.float32), self.window_to_photo)
 
     def with_other_faults(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images in which one fault of the camera differs by plus and minus its standard
-        deviation. The faults are vignetting and a tilt too small to be fitted. Half of the variance of the
-        tilt is used here (see ``other_tilts``).
+        """Yield the pair of images in which the vignetting of the camera differs by plus and minus its
+        standard deviation. Nothing is yielded if a flat field was given.
         """
-        yield from (self._warped(self.counts, warp) for pair in self.other_tilts for warp in pair)
         for sign in (1, -1) if self.record.vignetting_sd else ():
             yield self._warped(self.counts, self.window_to_photo, sign * self.record.vignetting_sd)
 
     def with_other_fits(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one fitted property of the camera differs by plus and minus its
-        standard deviation. The properties are the independent movements of the camera, the dark level, and a
-        tilt too small to be fitted. Half of the variance of the tilt is used here (see ``other_tilts``).
+        standard deviation. The properties are the independent movements of the camera and the dark level.
         """
-        pairs = self.other_warps + self.other_tilts
-        yield from (self._warped(self.counts, warp) for pair in pairs for warp in pair)
+        yield from (self._warped(self.counts, warp) for pair in self.other_warps for warp in pair)
         for sign in (1, -1) if self.record.dark_level_sd else ():
             darker = self.counts - np.float32(sign * self.record.dark_level_sd)
             yield self._warped(darker, self.window_to_photo)
@@ -245,9 +228,9 @@ def photographed_image(
 
     The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
     neighbours. Then a model of the camera is fitted by least squares, so that the photograph matches the
-    expected image. The parameters of the camera are position, rotation, gain and background, and a tilt if
-    needed. The scale is fitted only if the pitch has an uncertainty, because a fitted scale would conceal
-    that a print makes its image too large. All eight orientations are tried. A photograph that fits another
+    expected image. The parameters of the camera are position, rotation, tilt, gain and background. The scale
+    is fitted only if the pitch has an uncertainty, because a fitted scale would conceal that a print makes
+    its image too large. All eight orientations are tried. A photograph that fits another
     orientation better than ``orientation`` is rejected.
 
     Args:
@@ -343,11 +326,8 @@ def photographed_image(
         notes=notes,
     )
     side = len(wanted)
-    where, lit = fit.window_to_photo, fit.gain * wanted
-    warps, tilts = fit.other_warps, fit.other_tilts
-    return Photograph(
-        counts, where, side, wanted_pitch_um, finest_per_um, averaged_um, record, lit, warps, tilts
-    )
+    where, lit, warps = fit.window_to_photo, fit.gain * wanted, fit.other_warps
+    return Photograph(counts, where, side, wanted_pitch_um, finest_per_um, averaged_um, record, lit, warps)
 
 
 def _saturated(raw: np.ndarray) -> float:
@@ -466,8 +446,8 @@ def _replace_outliers(photo: np.ndarray, finest_per_px: float) -> tuple[np.ndarr
 @dataclass(frozen=True)
 class _Fit:
     """A fitted camera: the map from window pixels to photograph pixels (a matrix of shape (3, 3)), the pairs
-    of maps ``other_warps`` and ``other_tilts`` (see ``Photograph``), and the other parameters of the camera
-    with their standard deviations.
+    of maps ``other_warps`` (see ``Photograph``), and the other parameters of the camera with their standard
+    deviations.
     """
 
     window_to_photo: np.ndarray
@@ -479,7 +459,6 @@ class _Fit:
     gamma_sd: float = 0.0
     blur_px: float = 0.0
     other_warps: list[list[np.ndarray]] = field(default_factory=list)
-    other_tilts: list[list[np.ndarray]] = field(default_factory=list)
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
@@ -513,7 +492,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     # needed, 1e-4 is accurate enough.
     close = 1e-8 if further else 1e-4
 
-    def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
+    def solved(columns: list[int], image: Any, model: Any, start: np.ndarray, known: dict[int, float]) -> Any:
         target = (model - model.mean()) / model.std()
 
         def residual(step: np.ndarray) -> np.ndarray:
@@ -521,9 +500,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             at[columns] += step * unit[columns]
             one = seen(image, at)
             off = (one - one.mean()) / max(float(one.std()), 1e-12) - target
-            # These residuals express prior knowledge of scale and tilts.
-            prior = [at[3] / pitch_sd] if 3 in columns and pitch_sd else []
-            prior += [at[i] / _TILT_SD for i in (4, 5) if i in columns]
+            # These residuals express prior knowledge of scale or tilts.
+            prior = [at[column] / sd for column, sd in known.items()]
             return np.append(off.ravel() / math.sqrt(alike), prior)
 
         def slopes(step: np.ndarray) -> np.ndarray:
@@ -545,61 +523,38 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         images = smooth, fixed
         if more:
             images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
-        pose, found = solved(free, *images, pose)
-    correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
-    small_tilt = None
+        pose, _ = solved(free, *images, pose, {3: pitch_sd} if pitch_sd else {})
+    spread, scale_sd = np.zeros((0, 0)), 0.0
     if further:
-        tilted, of_tilt = solved([*free, 4, 5], smooth, fixed, pose)
-        closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
-        tilt, spread = tilted[4:] / unit[4:], _covariance(of_tilt.jac, of_tilt.fun, side)
-        surely = tilt @ np.linalg.solve(spread[-2:, -2:], tilt) > _TILT_SURE
-        if surely and 1 - closer**2 < _NEEDED * (1 - correlation**2):
-            pose, correlation, free = tilted, closer, [*free, 4, 5]
-        else:
-            small_tilt = spread[-2:, -2:]
-            spread = _covariance(found.jac, found.fun, side)
+        free += [4, 5]
+        pose, found = solved(free, smooth, fixed, pose, {4: _TILT_SD, 5: _TILT_SD})
+        spread = covariance_by_tiles(found.jac, found.fun, (side, side))
+        spread += np.diag([0, 0, 0, *[(_PRINT_SCALE_SD / unit[3]) ** 2] * (len(free) - 3)])
+        if pitch_sd:
+            # The photograph shows the scale of the camera times that of the print. Both are known to be close
+            # to 1, so the most probable scale of the camera is closer to 1 (linear Bayesian update).
+            share = spread[:, 3] / (spread[3, 3] + (pitch_sd / unit[3]) ** 2)
+            pose[free] -= share * pose[3] / unit[3] * unit[free]
+            spread -= np.outer(share, spread[3])
+            scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
     warp = _camera(pose, photo.shape, side, scale)
+    correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
     if not further or not correlation > 0:
         return _Fit(warp, correlation)
-    scale_sd = 0.0
-    if pitch_sd:
-        spread[3, 3] += (min(pitch_sd, _PRINT_SCALE_SD) / unit[3]) ** 2
-        scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
-    light = _light(seen(photo, pose), wanted, alike)
-
-    def around(columns: list[int], covariance: np.ndarray) -> list[list[np.ndarray]]:
-        """Let only the parameters of the pose with the numbers ``columns`` change. Return a pair of maps for
-        each independent change: the map after this change, and the map after the opposite change.
-        """
-        variance, ways = np.linalg.eigh(covariance)
-        steps = np.zeros((len(columns), len(pose)))
-        steps[:, columns] = (ways * np.sqrt(variance.clip(0))).T * unit[columns]
-        return [[_camera(at, photo.shape, side, scale) for at in (pose + one, pose - one)] for one in steps]
-
+    # One pair of maps for each independent movement of the camera.
+    variance, ways = np.linalg.eigh(spread)
+    steps = np.zeros((len(free), len(pose)))
+    steps[:, free] = (ways * np.sqrt(variance.clip(0))).T * unit[free]
     return _Fit(
         warp,
         correlation,
-        other_warps=around(free, spread),
-        other_tilts=[] if small_tilt is None else around([4, 5], small_tilt / 2),
+        other_warps=[
+            [_camera(at, photo.shape, side, scale) for at in (pose + one, pose - one)] for one in steps
+        ],
         position_sd_px=float(np.sqrt(np.diag(spread)[:2].mean())),
         scale_sd=scale_sd,
-        **light,
+        **_light(seen(photo, pose), wanted, alike),
     )
-
-
-def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
-    """Return the covariance of a least-squares fit in which the residuals of neighbouring pixels are
-    correlated. The covariance is computed from the scatter between tiles of the window, and each tile counts
-    as one observation (White 1980). If the print differs from the expected print, it appears to be displaced
-    by a different amount in each tile. The covariance includes this effect.
-    """
-    tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
-    number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))
-    pull = np.zeros((_TILES**2 + 1, slopes.shape[1]))
-    np.add.at(pull, number, slopes * residual[:, None])
-    inverse = np.linalg.pinv(slopes.T @ slopes)
-    found: np.ndarray = _BEYOND_TILES**2 * inverse @ (pull.T @ pull) @ inverse
-    return found
 
 
 def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, float]:
