@@ -366,8 +366,12 @@ def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float
     import cv2
 
     way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-    seen = cv2.warpPerspective(cv2.blur(photo, (3, 3)), fit.window_to_photo, wanted.shape, **way)
-    blurred = cv2.GaussianBlur(wanted, (0, 0), max(fit.blur_px, 0.5))
+    seen: Any = cv2.warpPerspective(photo, fit.window_to_photo, wanted.shape, **way)
+    # Noise is averaged over three camera pixels. The expected image must be averaged over the same area,
+    # because its dark gaps may be as narrow.
+    averaged_px = math.sqrt(2 / 3 / abs(np.linalg.det(fit.window_to_photo)))
+    seen = cv2.GaussianBlur(seen, (0, 0), averaged_px)
+    blurred = cv2.GaussianBlur(wanted, (0, 0), math.hypot(averaged_px, max(fit.blur_px, 0.5)))
     inside = _inside(fit.window_to_photo, photo.shape, len(wanted))
     shares = [1, 3, 10]
     found, expected = (np.percentile(one[inside], shares) for one in (seen, blurred))
