@@ -68,14 +68,15 @@ def mean_within(h: np.ndarray, reach_um: float) -> np.ndarray:
 
 def beside(h: np.ndarray, side: str, length_um: float) -> np.ndarray:
     """Return the running mean that starts at one side: y_i = y_(i-1) + (h_i - y_(i-1)) / (1 + l / dx)."""
-    turned = {"left": h, "right": h[:, ::-1], "above": h.T, "below": h.T[:, ::-1]}[side]
+    along = slice(None, None, -SIGNS[side])
+    turned = h[:, along]
     found = turned.copy()
     for i in range(1, turned.shape[1]):
         found[:, i] = found[:, i - 1] + (turned[:, i] - found[:, i - 1]) / (1 + length_um / PITCH_UM)
-    return {"left": found, "right": found[:, ::-1], "above": found.T, "below": found[:, ::-1].T}[side]
+    return found[:, along]
 
 
-AXES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y", 1)}
+SIGNS = {"left": -1, "right": 1}
 
 
 def tail(h: np.ndarray, sides: tuple[str, ...], length_um: float, turn_deg: float) -> np.ndarray:
@@ -88,8 +89,8 @@ def tail(h: np.ndarray, sides: tuple[str, ...], length_um: float, turn_deg: floa
     padded = np.pad(h, edge, mode="edge")
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, PITCH_UM) for n in padded.shape), indexing="ij")
     transfer = np.zeros(padded.shape, complex)
-    for axis, sign in (AXES[side] for side in sides):
-        delay = np.exp(2j * np.pi * sign * turned(axis, turn_deg, fy, fx) * PITCH_UM)
+    for side in sides:
+        delay = np.exp(2j * np.pi * SIGNS[side] * turned("x", turn_deg, fy, fx) * PITCH_UM)
         transfer += 1 / (1 + length_um / PITCH_UM * (1 - delay)) / len(sides)
     return np.fft.ifft2(np.fft.fft2(padded) * transfer).real[edge:-edge, edge:-edge]
 
@@ -160,8 +161,7 @@ def formulas() -> dict[str, Formula]:
     found["dose-times-density"] = lambda h, length_um, power: (
         h * (mean_within(h, length_um) / FULL_UM) ** power
     )
-    both = {"along-x": ("left", "right"), "along-y": ("above", "below")}
-    for name, sides in {**both, **{f"from-{side}": (side,) for side in AXES}}.items():
+    for name, sides in {"along": ("left", "right"), "from": ("left",)}.items():
         found[f"dose-{name}"] = lambda h, length_um, turn_deg, s=sides: tail(h, s, length_um, turn_deg) - h
     return found
 
