@@ -240,10 +240,11 @@ def _jumps(a: str) -> Iterator[Effect]:
 def _tail(name: str, sides: str, *signs: int) -> Effect:
     formula = f"(mean of D on {sides} along x over the length) - D"
     law = _law(name, formula, "1", lambda s: s.trailing(*signs) - s.h, _TAIL, "layout")
+    typical = law.parameters["strength"].typical
     # A tail on both sides looks the same after half a turn.
     circle = 360 // len(signs)
     trials = tuple(
-        {"strength": 0.05, "length_um": length_um, "turn_deg": float(turn_deg)}
+        {"strength": typical, "length_um": length_um, "turn_deg": float(turn_deg)}
         for length_um, step_deg in _TAILS.items()
         for turn_deg in range(-circle // 2, circle // 2, step_deg)
     )

@@ -19,10 +19,10 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.fits import State, fit_state
 from litho_models.loop.judging import judge_states
-from litho_models.loop.learner import ridge_squares
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screening, Secants
 from litho_models.loop.search import Cause, describe, with_table
+from litho_models.scan_terms.grouped import ALL, Block, Products
 
 # An effect is rejected as the cause if variants of the change that it makes would add more than this fraction
 # to its gain (its reduction of the squared error on held-out scans). In trials on the virtual fab, variants
@@ -159,9 +159,11 @@ def reshaped_gain(without: State, state: State) -> float:
         maps = _shapes(own - other, own, window)
         freed = window.freed(np.column_stack([left, *map(window.at_sample, maps)]), own)
         grams.append(freed.T @ freed / len(freed))
-    products = np.stack(grams)
-    # Without a prior, the many parameters would fit the noise of the few scans.
-    taken = products[:, 0, 0] - ridge_squares(products, study.fold_of, [0.02])
+    products = Products.ungrouped(np.stack(grams))
+    # The last argument of ``Block`` is the weight of the prior that no variant is present, stated as a number
+    # of scans. Without this prior, the many parameters would fit the noise of the few scans.
+    block = Block(tuple(range(1, products.grams.shape[1])), ALL, 0.02)
+    taken = products.grams[:, 0, 0] - products.held_out([block], study.fold_of)
     return float(taken.mean()) * NM_PER_UM**2
 
 

@@ -8,6 +8,7 @@ change of the prediction per unit of a parameter or of a strength.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -52,9 +53,17 @@ class JointFit:
         cut = 1 + self.own
         rows = self.grams[..., 1:cut, :]
         right = rows[..., :1] - rows[..., cut:] @ strengths[..., None]
-        parameters = _inverse(rows[..., 1:cut].sum(axis=-3)) @ right.sum(axis=-3)
+        parameters = self._inverse_of_parameters @ right.sum(axis=-3)
         one = np.ones((*strengths.shape[:-1], 1))
         return np.concatenate([one, -parameters[..., None, :, 0] * one, -strengths], axis=-1)
+
+    @cached_property
+    def _inverse_of_parameters(self) -> np.ndarray:
+        """Return the inverse of the inner products of the parameters' columns over all groups, of shape (…,
+        p, p).
+        """
+        own = slice(1, 1 + self.own)
+        return _inverse(self.grams[..., own, own].sum(axis=-3))
 
     @property
     def of_columns(self) -> np.ndarray:
@@ -67,7 +76,7 @@ class JointFit:
         """
         cut = 1 + self.own
         rows = self.grams[..., 1:cut, :]
-        fitted = _inverse(rows[..., 1:cut].sum(axis=-3))[..., None, :, :] @ rows[..., cut:]
+        fitted = self._inverse_of_parameters[..., None, :, :] @ rows[..., cut:]
         return self.of_columns - np.swapaxes(rows[..., cut:], -1, -2) @ fitted
 
 

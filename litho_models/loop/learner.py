@@ -32,7 +32,8 @@ _KEPT_BYTES = 512 * 2**20
 # Indices of the features whose strength may depend on the writing order or the dose: the height, |∂y| and
 # |∂x| of the layout blurred with σ = 0.3 µm, and the layout blurred with σ = 1.6 µm (the surroundings).
 _VARYING = (18, 21, 22, 7)
-# The strengths of the regularisation that are tried; see ``ridge_squares``.
+# Strengths of the regularisation from which the ridge regression chooses one. Each is the weight of the prior
+# that no feature matters, stated as a number of scans.
 _SHRINKINGS = (100.0, 10.0, 1.0, 1e-1, 1e-2, 1e-3)
 
 
@@ -116,11 +117,12 @@ class Learner:
         for scan, own, (rows, basis, inner) in zip(self._study.scans, predictions, self._parts, strict=True):
             residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
-            products.append(np.pad(inner, [(1, 0), (1, 0)]))
-            products[-1][0, 0] = np.mean(residual**2)
-            products[-1][0, 1:] = products[-1][1:, 0] = rows @ residual / len(residual)
+            whole = np.pad(inner, [(1, 0), (1, 0)])
+            whole[0, 0] = np.mean(residual**2)
+            whole[0, 1:] = whole[1:, 0] = rows @ residual / len(residual)
+            products.append(whole)
         grams = np.stack(products)
-        left = ridge_squares(grams, self._study.fold_of, _SHRINKINGS) * NM_PER_UM**2
+        left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
         squares = grams[:, 0, 0] * NM_PER_UM**2
         return Rest(squares - left, squares)
 
@@ -144,22 +146,15 @@ class Learner:
         return np.concatenate(columns).astype(np.float32)
 
 
-def ridge_squares(grams: np.ndarray, fold_of: np.ndarray, shrinkings: Sequence[float]) -> np.ndarray:
-    """Return the mean squared residual that a ridge regression on m columns leaves in each scan. For each
-    scan, the regression is fitted, and its regularisation is chosen, without the scans of the same fold. The
-    result has shape (scans,).
-
-    Args:
-        grams: inner products of the residual (index 0) and the columns in each scan, divided by the number of
-            pixels, of shape (scans, 1 + m, 1 + m).
-        fold_of: number of the fold of each scan, of shape (scans,).
-        shrinkings: the strengths of the regularisation from which one is chosen. Each is the weight of the
-            prior that no column is present, stated as a number of scans. If only one scan is left for the
-            fit, the strengths cannot be compared, and the first of them is used.
+def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
+    """Return the mean squared residual that the ridge regression leaves in each scan. For each scan, the
+    regression is fitted, and its regularisation is chosen, without the scans of the same fold. If only one
+    scan is left for the fit, the strengths of the regularisation cannot be compared, and the first of them is
+    used. The result has shape (scans,).
     """
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
-    blocks = [Block(columns, ALL, shrinking) for shrinking in shrinkings]
+    blocks = [Block(columns, ALL, shrinking) for shrinking in _SHRINKINGS]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]

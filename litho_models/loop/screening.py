@@ -283,7 +283,7 @@ class Screening:
         name of the grouping.
         """
         members = _members(self._numbers)
-        fit = self._fit(trial, members)
+        fit = _joint_fit(self._products(trial), trial, members)
         strengths, gains_nm2 = fit.strengths(), self._gains(self._numbers, trial)
         raw = np.maximum(members @ self._raw[:, trial.columns], 1e-300)
         alone, beside = (
@@ -346,13 +346,6 @@ class Screening:
         at = np.array([*own, *trial.columns])
         return self._grams[:, at[:, None], at]
 
-    def _fit(self, trial: Trial, members: np.ndarray) -> JointFit:
-        """Return the joint fit of a trial and the model's own parameters to groups of scans. ``members`` is
-        the mask of the scans in each group, of shape (…, groups, scans).
-        """
-        summed = np.tensordot(members, self._products(trial), 1)
-        return JointFit(summed, summed.shape[-1] - 1 - len(trial.columns))
-
     def _gains(self, groupings: np.ndarray, trial: Trial) -> np.ndarray:
         """Return the gain of a trial on each scan, nm², of shape (groupings, scans). The strengths of its
         columns differ by group. They are fitted together with the model's own parameters, without the fold of
@@ -363,14 +356,13 @@ class Screening:
             groupings: the number of each scan's group in one or more groupings, of shape (groupings, scans).
             trial: the trial.
         """
-        fold_of = self.study.fold_of
+        products, fold_of = self._products(trial), self.study.fold_of
         outside = np.arange(fold_of.max() + 1)[:, None] != fold_of
-        fit = self._fit(trial, _members(groupings)[:, None] & outside[:, None])
+        fit = _joint_fit(products, trial, _members(groupings)[:, None] & outside[:, None])
         found = fit.strengths()
         if trial.sets:
             found *= (trial.allowed(found, -1) * trial.reach(found))[..., None]
         at = np.arange(len(groupings))[:, None], fold_of, groupings
-        products = self._products(trial)
         before, after = (
             np.einsum("gsi,sij,gsj->gs", rest, products, rest, optimize=True)
             for rest in (fit.rest(0 * found)[at], fit.rest(found)[at])
@@ -417,6 +409,17 @@ class Screening:
 def _alike(numbers: np.ndarray) -> np.ndarray:
     """Return the mask of the pairs of scans in the same group, of shape (…, scans, scans)."""
     return numbers[..., :, None] == numbers[..., None, :]
+
+
+def _joint_fit(products: np.ndarray, trial: Trial, members: np.ndarray) -> JointFit:
+    """Return the joint fit of a trial and the model's own parameters to groups of scans.
+
+    Args:
+        products: inner products in each scan, as returned by ``Screening._products``.
+        trial: the trial.
+        members: mask of the scans in each group, of shape (…, groups, scans).
+    """
+    return JointFit(np.tensordot(members, products, 1), products.shape[-1] - 1 - len(trial.columns))
 
 
 def _members(numbers: np.ndarray) -> np.ndarray:
