@@ -92,7 +92,13 @@ def next_print(
             have only one level, ``prints`` is not between 1 and 12, ``field_um`` is too small, or ``out``
             contains a plan with other settings.
     """
-    open_ = OpenQuestions.read(Path(loop) / OpenQuestions.FILE_NAME)
+    if not (Path(loop) / OpenQuestions.FILE_NAME).is_file():
+        raise InputError(
+            f"no {OpenQuestions.FILE_NAME} in {loop}",
+            wanted="the folder of a closed loop",
+            hint="litho-models close-loop writes this file",
+        )
+    open_ = OpenQuestions.read(Path(loop))
     if not open_.questions:
         return None
     if open_.instrument == "sem":
