@@ -182,7 +182,8 @@ def lead_text(
 
     Args:
         paired: differences between two arms in the scores of the judges, paired by seed, with their
-        intervals. means: mean score of each arm after printing.
+            intervals.
+        means: mean score of each arm after printing.
         figure: name of the score.
         sign: +1 if a higher score is better, -1 if a lower one is.
         judge: the judge that printed the designs.
@@ -200,11 +201,11 @@ def lead_text(
         open_ = "" if low * high > 0 else ", which includes 0"
         interval = f"({low:.{digits}f} to {high:.{digits}f}{open_})"
         designs = "without a model" if other == "none" else f"with {other}"
-        against.append(f"{turn * item['mean']:.{digits}f} {interval} than {designs}")
+        against.append(f"by {turn * item['mean']:.{digits}f} {interval} than {designs}")
     name, _, unit = LABELS[figure].removesuffix(")").partition(" (")
     return (
-        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. It is "
-        f"better by these differences{f' in {unit}' if unit else ''} (95 % interval): {'; '.join(against)}."
+        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. It is better "
+        f"{', '.join(against)} ({f'differences in {unit}, ' if unit else ''}with 95 % intervals)."
     )
 
 

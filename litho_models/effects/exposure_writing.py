@@ -208,7 +208,7 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     The frequency f is the alias frequency |1/p - 1/dx|, where dx is the pixel size. The ripples have a fixed
     phase in the write field, so they are the same in every print.
 
-    The noise figure of the paper shows such ripples, at a pitch of 0.1 µm.
+    The paper's figure of the noise shows such ripples, for hatching with a pitch of 0.1 µm.
     """
     across_um = context.centred_um()["yx".index(context.slow_axis)]
     phase = 2 * math.pi * values["frequency_per_um"] * across_um

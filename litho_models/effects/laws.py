@@ -108,7 +108,7 @@ class Surface:
         """Return the weighted mean height on one side of each pixel along the rotated x axis, or on both
         sides. The weights decay exponentially with distance, with the decay length ``length_um`` of the law.
 
-        The sign of a side is 1 if the pixels with smaller x influence a pixel, and -1 otherwise.
+        A sign of 1 stands for the side with smaller x, and -1 for the side with larger x.
         """
         length, pitch = self.values["length_um"], self.context.pitch_um
 

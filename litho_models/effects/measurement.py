@@ -41,7 +41,7 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     follows falling edges more slowly than rising edges, because it loses contact there (parachuting). The
     time constant of the lag is fixed, so l is shorter if the pixels are smaller.
 
-    The feedback loop is of first order. A probe that parachutes loses the surface on its way down.
+    The feedback loop is of first order. On falling slopes, the probe may lose the surface (parachuting).
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]

@@ -1,8 +1,8 @@
 """Fit the strengths of an effect together with the parameters of a model. The strengths differ between groups
 of scans, and the parameters of the model are the same in all scans.
 
-The fit is linear in both, and needs only inner products of the residual and the columns. A column is the
-change of the prediction per unit of a parameter or of a strength.
+The prediction is linearised. A column is its derivative with respect to one parameter or one strength, and
+the fit needs only the inner products of the residual and these columns.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 # An effect can be tested only if at least this fraction of the squared norm of its column remains after the
 # terms of each scan and the changes that the parameters of the model can make have been projected out.
-# Strengths that retain less are shrunk.
+# Strengths whose columns retain less are shrunk.
 SMALLEST_RETAINED = 1e-5
 _KEPT = 1 / (1 + SMALLEST_RETAINED)
 

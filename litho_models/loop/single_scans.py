@@ -128,7 +128,7 @@ class SingleScans:
         lines come from the microscope. If no scan were rotated, the two kinds of offsets could not be
         distinguished.
         """
-        # Profiles that all scans share are no offsets of the lines of single scans.
+        # The profile that all scans share is subtracted, because it does not belong to a single scan.
         along_y, along_x = (SingleScans(self.study, self._with_profile(axis)) for axis in (0, 1))
         judged = {name: along_x._judged(accepted, accepted | terms_of_effect(name)) for name in names}
         columns = along_y._judged(accepted, accepted | {"layout-columns"}).gains_nm2

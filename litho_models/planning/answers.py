@@ -65,10 +65,10 @@ def of_repeats(prints: int, scans: int) -> float:
 
 
 def variance_ratio(prints: int, scans: int) -> tuple[Any, float]:
-    """Return what is expected of the variance of a per-scan term between prints, divided by its variance
+    """Return the law of the ratio F of two variances of a per-scan term: that between prints, and that
     between the scans of one print. ``scans`` is the number of scans of all prints together. The result has
-    two items: the distribution of the ratio if the microscope causes the term, and the factor by which the
-    ratio is larger if the printer causes the term.
+    two items: the distribution of F if the microscope causes the term, and the factor by which F is larger if
+    the printer causes it.
     """
     return f(prints - 1, scans - prints), 1 + scans / prints * PRINT_SHARE / (1 - PRINT_SHARE)
 

@@ -198,7 +198,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     cv2.imwrite(str(tmp_path / "photo.png"), counts.astype(np.uint16))
     source = PhotoSource(tmp_path / "photo.png", 0.2)
     score = score_design(printed_design, tmp_path / "score", judges=[], camera=source).scores[0]
-    # The light of the darkest gaps, averaged over three camera pixels of 0.2 µm, is uncertain by 30 %.
+    # The dark level is found in the darkest gaps. How much light reaches them is known only to within 30 %.
     assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 300
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97

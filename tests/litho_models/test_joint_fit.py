@@ -28,7 +28,7 @@ def joint(found: np.ndarray) -> JointFit:
 
 
 def plain(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters and the strengths of each group by least squares."""
+    """Fit the parameters, and the strengths of each group, by plain least squares. Return both."""
     whole = np.zeros((GROUPS * PIXELS, OWN + GROUPS * COLUMNS))
     for group in range(GROUPS):
         own = slice(group * PIXELS, (group + 1) * PIXELS)
