@@ -43,6 +43,16 @@ class JointFit:
         parameters = _inverse(left[..., 1:, 1:]) @ left[..., 1:, :1]
         return _KEPT * (mixed[..., :1] - mixed[..., 1:] @ parameters[..., None, :, :])[..., 0]
 
+    def only(self, present: np.ndarray) -> JointFit:
+        """Return the joint fit in which the strengths of some groups are 0.
+
+        Args:
+            present: mask of the groups whose strengths are fitted, of shape (…, groups).
+        """
+        kept = np.ones((*present.shape, self.grams.shape[-1]))
+        kept[..., 1 + self.own :] = present[..., None]
+        return JointFit(self.grams * kept[..., :, None] * kept[..., None, :], self.own)
+
     def rest(self, strengths: np.ndarray) -> np.ndarray:
         """Return what remains of the residual at given strengths and the best parameters, as a combination of
         the residual and the columns, of shape (…, groups, 1 + p + m).

@@ -84,18 +84,28 @@ class Trial:
         null, lower, upper, _ = self._facts
         return np.where(steps > 0, upper, lower) - null
 
-    def allowed(self, multiples: np.ndarray, axis: int | None = None) -> np.ndarray:
-        """Return whether every amplitude lies on the allowed side of its null value after each parameter set
-        has been multiplied by its factor in ``multiples``, of shape (…, sets). If ``axis`` is -1, there is
-        one result per row of ``multiples``; otherwise, there is a single result for all rows.
+    def allowed(self, multiples: np.ndarray) -> np.ndarray:
+        """For each row of ``multiples``, of shape (…, sets), return whether every amplitude lies on the allowed
+        side of its null value after each parameter set has been multiplied by its factor.
 
-        An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude:
-        the largest of its row if ``axis`` is -1, and otherwise the largest of all rows.
+        An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude of
+        its row.
         """
         steps = self.steps(multiples)
         sizes = np.abs(steps) / self._facts[3]
-        large = sizes > 0.3 * sizes.max(axis=axis, keepdims=True)
-        return ~(large & (self._room(steps) == 0)).any(axis=axis)
+        large = sizes > 0.3 * sizes.max(axis=-1, keepdims=True)
+        return ~(large & (self._room(steps) == 0)).any(axis=-1)
+
+    def strengths(self, fit: JointFit) -> np.ndarray:
+        """Return the strengths of the joint fit, of shape (…, groups, sets). If the strengths of a group are
+        not allowed, the effect is absent from this group: its strengths are 0, and all others are fitted
+        again.
+        """
+        found = fit.strengths()
+        while self.sets and not (present := self.allowed(found)).all():
+            fit = fit.only(present)
+            found = fit.strengths()
+        return found
 
     def reach(self, multiples: np.ndarray) -> np.ndarray:
         """For each row of ``multiples``, return the largest factor, at most 1, by which the steps of all
@@ -181,7 +191,8 @@ class Screened:
             fitted without the fold of this scan.
         multiples: the factors by which the parameter sets of the trial are multiplied, keyed by group label.
             They are fitted to all scans.
-        allowed: whether the fitted amplitudes lie on physically possible sides of their null values.
+        allowed: whether the fitted amplitudes of at least one group lie on physically possible sides of their
+            null values.
         retained: fraction of a column's squared norm that remains after the scan terms and the changes that
             the model's own parameters can make have been projected out. If the trial has several columns,
             this is the largest of their fractions.
@@ -284,7 +295,7 @@ class Screening:
         """
         members = _members(self._numbers)
         fit = _joint_fit(self._products(trial), trial, members)
-        strengths, gains_nm2 = fit.strengths(), self._gains(self._numbers, trial)
+        strengths, gains_nm2 = trial.strengths(fit), self._gains(self._numbers, trial)
         raw = np.maximum(members @ self._raw[:, trial.columns], 1e-300)
         alone, beside = (
             (np.einsum("...ii->...i", own) / raw).max(axis=(1, 2)).tolist()
@@ -299,7 +310,7 @@ class Screening:
                 by=by,
                 gains_nm2=gains_nm2[at],
                 multiples=dict(zip(names, fitted, strict=True)),
-                allowed=not trial.sets or bool(trial.allowed(fitted)),
+                allowed=bool(fitted.any()),
                 retained=beside[at],
                 beside_base=alone[at],
             )
@@ -349,8 +360,7 @@ class Screening:
     def _gains(self, groupings: np.ndarray, trial: Trial) -> np.ndarray:
         """Return the gain of a trial on each scan, nm², of shape (groupings, scans). The strengths of its
         columns differ by group. They are fitted together with the model's own parameters, without the fold of
-        the scan, and reduced so that the amplitudes stay within their ranges. A strength that is not allowed
-        is set to 0.
+        the scan, and reduced so that the amplitudes stay within their ranges.
 
         Args:
             groupings: the number of each scan's group in one or more groupings, of shape (groupings, scans).
@@ -359,9 +369,9 @@ class Screening:
         products, fold_of = self._products(trial), self.study.fold_of
         outside = np.arange(fold_of.max() + 1)[:, None] != fold_of
         fit = _joint_fit(products, trial, _members(groupings)[:, None] & outside[:, None])
-        found = fit.strengths()
+        found = trial.strengths(fit)
         if trial.sets:
-            found *= (trial.allowed(found, -1) * trial.reach(found))[..., None]
+            found *= trial.reach(found)[..., None]
         at = np.arange(len(groupings))[:, None], fold_of, groupings
         before, after = (
             np.einsum("gsi,sij,gsj->gs", rest, products, rest, optimize=True)

@@ -8,6 +8,7 @@ import pytest
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Effect, Parameter
 from litho_models.loop.fits import State, Study, fit_state
+from litho_models.loop.joint_fit import JointFit
 from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
@@ -74,6 +75,17 @@ def test_a_blur_in_half_of_the_scans_is_found() -> None:
     np.testing.assert_allclose(found["field"].gain_nm2, gain_nm2, rtol=0.3)
     assert found[ALL].gain_nm2 < 0.5 * gain_nm2
     assert [one.by for one in screening.standing()] == ["field"]
+
+
+def test_a_group_that_would_need_a_negative_blur_has_none() -> None:
+    """Check the normal equations of one parameter of the base and one strength in each of two groups."""
+    effect = get_effect("defocus")
+    trial = Trial(effect, effect.trials[:1], [2])
+    grams = np.array([[[9.0, 0.0, right], [0.0, 1.0, 1.0], [right, 1.0, 2.0]] for right in (-2.0, 4.0)])
+    fit = JointFit(grams, 1)
+    # Without bounds, p + 2 s = -2, p + 2 t = 4 and 2 p + s + t = 0. With s = 0, p + 2 t = 4 and 2 p + t = 0.
+    np.testing.assert_allclose(fit.strengths()[:, 0], [-1 / 2, 5 / 2], rtol=1e-4)
+    np.testing.assert_allclose(trial.strengths(fit)[:, 0], [0, 8 / 3], rtol=1e-4)
 
 
 def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
@@ -159,8 +171,8 @@ def test_an_impossible_sign_is_allowed_only_for_a_relatively_small_strength() ->
     assert trial.allowed(np.array([1.0, 1.0]))
     assert not trial.allowed(np.array([-1.0, 0.0]))
     assert not trial.allowed(np.array([-1.0, 1.0]))
-    # A wrong sign counts as noise if another group has ten times the strength.
-    assert trial.allowed(np.array([[-1.0, 0.0], [10.0, 0.0]]))
+    # Groups are judged one by one.
+    assert trial.allowed(np.array([[-1.0, 0.0], [10.0, 0.0]])).tolist() == [False, True]
     assert trial.allowed(np.array([-0.1, 1.0]))
     # b may have either sign.
     assert trial.allowed(np.array([1.0, -1.0]))
