@@ -85,8 +85,8 @@ class Trial:
         return np.where(steps > 0, upper, lower) - null
 
     def allowed(self, multiples: np.ndarray) -> np.ndarray:
-        """For each row of ``multiples``, of shape (…, sets), return whether every amplitude lies on the allowed
-        side of its null value after each parameter set has been multiplied by its factor.
+        """Return for each row of ``multiples``, of shape (…, sets), whether every amplitude lies on the
+        allowed side of its null value after each parameter set has been multiplied by its factor.
 
         An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude of
         its row.
