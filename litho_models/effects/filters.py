@@ -55,12 +55,13 @@ def add_filtered(
 
 def add_blur(field: Tensor, variance_um2: Tensor | float, pitch_um: float, reach_um: float) -> Tensor:
     """Blur a field isotropically with a Gaussian of variance s² (µm²): T = exp(-2 π² s² f²)."""
-    return add_filtered(
-        field,
-        lambda fy, fx: torch.expm1(-2 * math.pi**2 * variance_um2 * (fy * fy + fx * fx)),
-        pitch_um,
-        reach_um,
-    )
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        along_y, along_x = (torch.expm1(-2 * math.pi**2 * variance_um2 * f * f) for f in (fy, fx))
+        # With T = (1 + along_y) (1 + along_x), only one exponential per row and per column is needed.
+        return along_y + along_x * (1 + along_y)
+
+    return add_filtered(field, transfer_minus_one, pitch_um, reach_um)
 
 
 def local_mean(field: Tensor, length: Tensor, pitch: float, reach: float = 3.0) -> Tensor:
