@@ -148,7 +148,8 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         study.report(f"searching for effects that {name} lacks")
         # The other bases probably lack the same causes as the first base, so their searches start from the
         # causes that were found with the first base.
-        searches[name] = search(state, candidates, seed=next(iter(searches.values()), None))
+        first = next(iter(searches.values()), Found(state))
+        searches[name] = search(first.with_base(state), candidates)
     chosen = _simplest(searches)
     start, named = starts[chosen], searches.pop(chosen)
     rest = _rest_beside(start)
@@ -262,8 +263,9 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     in a model that also contains the laws. This model contains a table, too, if the table reduces the error
     more than all causes together.
 
-    A cause that fails its check is removed, and the search for laws and tables is repeated without it. Return
-    the result of the search for laws and the result of the search for tables.
+    A cause that fails its check is removed, and the search for laws and tables is repeated without it. The
+    repeated search starts from the laws that were found before. Return the result of the search for laws and
+    the result of the search for tables.
 
     Args:
         start: the fitted base model.
@@ -276,13 +278,16 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     all_laws = (FILM_LAWS if study.of_films else LAWS).values()
     tables = [] if study.of_films else [*TABLES.values()]
     secants = [Secants(start.twin, window) for window in study.windows]
+    lawful = Found(named.state)
     while True:
         study.report("searching the residual for laws")
         # A law with the same formula as a cause in the model is not tried, because it would only rename this
         # cause.
         formulas = {get_effect(name).apply for name in named.state.twin.names}
         laws = [law for law in all_laws if law.apply not in formulas]
-        lawful = search(named.state, laws, 4, secants)
+        lawful = search(lawful, laws, 4, secants)
+        if not lawful.causes:
+            lawful.state = named.state
         study.report("searching for tables that describe the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
@@ -306,6 +311,7 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
             named.failed.append(one)
             named.causes.remove(one)
             named.state = named.state.without(one.name) if named.causes else start
+            lawful.state = lawful.state.without(one.name)
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:

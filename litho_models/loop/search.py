@@ -87,32 +87,31 @@ class Found:
         alike = {cause.name, *cause.alike, *cause.excluded}
         return any(alike & {one.name, *one.alike} for one in self.causes)
 
+    def with_base(self, start: State) -> Found:
+        """Return the same effects, fitted together with another base model. ``start`` is this base model,
+        fitted without effects.
+        """
+        if not self.causes:
+            return Found(start)
+        twin = replace(start.twin, effects=self.state.twin.effects)
+        return Found(fit_state(twin, start.study), [*self.causes], self.first)
+
 
 def search(
-    start: State,
-    candidates: Sequence[Effect],
-    most: int = 8,
-    secants: Sequence[Secants] | None = None,
-    seed: Found | None = None,
+    found: Found, candidates: Sequence[Effect], most: int = 8, secants: Sequence[Secants] | None = None
 ) -> Found:
     """Add effects to a fitted model as long as held-out scans confirm them.
 
     Args:
-        start: the fitted model.
+        found: the fitted model. If it already contains effects that an earlier search has added, these are
+            first tested again. It is changed in place.
         candidates: effects that may be added.
         most: largest number of effects in the result.
         secants: for each window, the changes that the candidates make to the prediction of a similar model.
             If they are given, they are used as approximations, and the changes of the predictions of the
             current model are not computed.
-        seed: result of the same search with another base model. If it is given, the effects that it contains
-            are first tested in the model ``start``. The search continues from those effects that held-out
-            scans confirm.
     """
-    found = Found(start)
-    if seed and seed.causes:
-        twin = replace(start.twin, effects=seed.state.twin.effects)
-        found = Found(fit_state(twin, start.study), list(seed.causes), seed.first)
-        _test_again(found)
+    _test_again(found)
     while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
     _defend(found)

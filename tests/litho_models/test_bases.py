@@ -32,7 +32,7 @@ from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.model import FoldedBase, Twin
 from litho_models.loop.prepared import exposed
 from litho_models.loop.run import close_loop
-from litho_models.loop.search import search
+from litho_models.loop.search import Found, search
 from litho_models.models import build_model
 from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
@@ -160,7 +160,7 @@ def test_the_search_adds_a_law_that_a_trained_model_lacks_and_none_that_it_has()
     study = study_of(planted([(LAW, ALL, {"": STRENGTH})]))
     for base, names in ((base_model().requires_grad_(False), [LAW]), (Carrying(), [])):
         start = fit_state(Twin.bare(base), study)
-        found = search(start, [get_effect(LAW), get_effect("height-power-2")])
+        found = search(Found(start), [get_effect(LAW), get_effect("height-power-2")])
         assert [one.name for one in found.causes] == names
         assert found.state.twin.own == 0
         # The residual is the white noise of 4 nm.

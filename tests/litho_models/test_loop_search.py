@@ -45,7 +45,7 @@ def memory(strength: float) -> dict[str, float]:
 
 def found_in(*effects: tuple[str, str, Values], **facts: int) -> Found:
     study = study_of(planted(effects, **facts))
-    return search(bare_state(study), CANDIDATES)
+    return search(Found(bare_state(study)), CANDIDATES)
 
 
 def added(found: Found) -> dict[str, str]:
@@ -78,7 +78,8 @@ def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool, in_all_s
     or does not.
     """
     lacking = [(MEMORY, ALL, {"": memory(0.3)}), (THINNING, ALL, {"": thinning(0.2)})][: 1 + needed]
-    found = search(bare_state(study_of(planted(lacking, seed=1))), CANDIDATES, seed=in_all_scans)
+    start = bare_state(study_of(planted(lacking, seed=1)))
+    found = search(in_all_scans.with_base(start), CANDIDATES)
     assert added(found) == {name: ALL for name, *_ in lacking}
     if not needed:
         assert found.refused[THINNING]
@@ -182,14 +183,14 @@ def test_a_cause_that_another_resembles_is_found(
     )
     study = study_of(scans)
     start = fit_state(Twin.bare(build_model("physics")), study)
-    found = search(start, [effect, *map(get_effect, beside)])
+    found = search(Found(start), [effect, *map(get_effect, beside)])
     assert added(found) == {name: ALL}
     assert found.causes[0].alike == ()
 
 
 def test_no_more_effects_than_asked_for() -> None:
     study = study_of(planted([(THINNING, ALL, {"": thinning(0.15)})]))
-    assert search(bare_state(study), CANDIDATES, most=0).causes == []
+    assert search(Found(bare_state(study)), CANDIDATES, most=0).causes == []
 
 
 def test_a_change_is_the_same_as_itself_scaled_and_no_other() -> None:

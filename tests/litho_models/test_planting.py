@@ -15,7 +15,7 @@ from litho_models.loop.closing import Closed, _rest_beside
 from litho_models.loop.fits import fit_state
 from litho_models.loop.model import Twin
 from litho_models.loop.planting import parse_planted, plant
-from litho_models.loop.search import search
+from litho_models.loop.search import Found, search
 from tests.litho_models.loop_scans import base_model, planted, study_of
 
 LAW = "height-times-slope-size-x"
@@ -25,7 +25,7 @@ def closed_on(scans: Sequence[PrintedScan]) -> Closed:
     """Run only the search of the loop, with two laws as candidates."""
     study = study_of(scans)
     base = fit_state(Twin.bare(base_model()), study)
-    found = search(base, [get_effect(LAW), get_effect("height-power-2")])
+    found = search(Found(base), [get_effect(LAW), get_effect("height-power-2")])
     return Closed("affine-mtf", {}, base, base, found, found, found, _rest_beside(base), {})
 
 
