@@ -80,7 +80,7 @@ def cross_fit(
     bad = int(np.sum(~np.isfinite(prediction[usable])))
     if bad:
         raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="finite heights")
-    difference = np.where(usable, height - prediction, 0.0)
+    difference = height - prediction
     residual = np.full(height.shape, np.nan)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
     lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines]

@@ -161,8 +161,7 @@ def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
     """Return maps of x, y, x², xy and y² over a scan, where x and y run from -1 to 1. The mean of each map is
     subtracted. The result has shape (5, ny, nx) and is read-only.
     """
-    ny, nx = shape
-    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     shapes = np.stack([term - term.mean() for term in (x, y, x * x, x * y, y * y)])
     shapes.setflags(write=False)
     return shapes
