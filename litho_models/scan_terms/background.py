@@ -103,7 +103,7 @@ def of_usual_size(
 
 def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
     """Return whether a scan's field has the size (y, x) given in µm, within 1 %."""
-    return bool(np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0))
+    return np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0)
 
 
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
@@ -128,7 +128,7 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
         coefficients, _ = fitted_terms(scan.height_um, prediction, usable, POLICIES["full"])
         own = coefficients[2:] @ smooth_shapes(scan.shape)[:, usable]
         shapes = on_field(scan, smooth_shapes)[:, usable]
-        shapes = shapes - shapes.mean(axis=1, keepdims=True)
+        shapes -= shapes.mean(axis=1, keepdims=True)
         products += shapes @ shapes.T
         seen += shapes @ own
     x, y, xx, xy, yy = (NM_PER_UM * np.linalg.lstsq(products, seen, rcond=1e-12)[0]).tolist()

@@ -73,18 +73,15 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     def add(names: Iterable[str]) -> None:
         for name in names:
             labels = tuple(label_of(scan, name) for scan in scans)
-            if _is_grouped(labels) and _division(labels) not in map(_division, found.values()):
+            counts = Counter(labels).values()
+            grouped = 1 < len(counts) <= 2 * sum(count >= FEWEST_IN_GROUP for count in counts)
+            if grouped and _division(labels) not in map(_division, found.values()):
                 found[name] = labels
 
     add(names)
     if by_order:
         add(f"order {last}-{first}" for last, first in _places(scans, "print" in found))
     return found
-
-
-def _is_grouped(labels: Labels) -> bool:
-    counts = Counter(labels).values()
-    return len(counts) > 1 and 2 * sum(count >= FEWEST_IN_GROUP for count in counts) >= len(counts)
 
 
 def _division(labels: Labels) -> list[int]:

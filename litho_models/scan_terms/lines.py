@@ -36,7 +36,7 @@ def axis_along(line: LineIndex) -> int:
     """Return the array axis along which the lines run. It is 1 for lines along x, and 0 for lines along y.
     Lines along y occur in scans that are rotated by 90 degrees.
     """
-    down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
+    down, across = (np.abs(np.diff(line, axis=axis)).mean() for axis in (0, 1))
     return int(down >= across)
 
 

@@ -23,7 +23,6 @@ from litho_models.scan_terms.measurement import (
     MeasurementModel,
     Shared,
     SharedPart,
-    displaced,
     polynomial_count,
     polynomials,
 )
@@ -76,11 +75,10 @@ def learn_measurement(
             coefficients of these parts are fitted again.
     """
     usual_um, pairs = of_usual_size(scans, predictions_um)
-    model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     if scans[0].seen_by == "sem":
-        return model
+        return MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     levelling = like.levelling if like else _best_levelling(pairs)
-    model = model.model_copy(update={"levelling": levelling, "scans": len(pairs)})
+    model = MeasurementModel(levelling=levelling, parts=[], field_um=usual_um, scans=len(pairs))
     groups = groupings([scan for scan, _ in pairs], by_order=False)
     chosen = like.parts if like else None
     for _ in range(_ROUNDS):
@@ -102,14 +100,14 @@ def _chosen(products: Products, fold_of: np.ndarray) -> list[SharedPart]:
         return chosen
     left = products.held_out([], fold_of)
     while offers := _offers(products.groups, chosen):
-        tried = [products.held_out([*map(_block, (*chosen, one))], fold_of) for one in offers]
-        best = int(np.argmin([one.mean() for one in tried]))
-        gain = left - tried[best]
+        tried = (products.held_out([*map(_block, (*chosen, one))], fold_of) for one in offers)
+        best, rest = min(zip(offers, tried, strict=True), key=lambda pair: pair[1].mean())
+        gain = left - rest
         error = gain.std(ddof=1) / np.sqrt(len(gain))
         if gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
             break
-        chosen.append(offers[best])
-        left = tried[best]
+        chosen.append(best)
+        left = rest
     return chosen
 
 
@@ -147,7 +145,7 @@ def _gram(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     shrinks the coefficients only once, however many rounds there are.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
-    seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
+    seen = model.displaced_um(scan, prediction_um)
     slope_y, slope_x = np.array(np.gradient(seen, scan.pitch_um))[:, at]
     shapes = polynomials(scan.shape, _HIGHEST)[:, at]
     lateral = shapes[: polynomial_count(_LATERAL)]
@@ -157,9 +155,8 @@ def _gram(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     moved -= least_squares(surface, moved.T).T @ surface
     residual = (scan.height_um - model.expected_um(scan, prediction_um))[at]
     rows = np.stack([residual, *shapes[1:], *moved])
-    for part in model.parts:
-        if known := part.of(scan):
-            rows[0] += known @ rows[list(_block(part).columns)]
+    for part in model.parts_of(scan):
+        rows[0] += part.of(scan) @ rows[list(_block(part).columns)]
     rows -= rows.mean(axis=1, keepdims=True)
     return rows @ rows.T / rows.shape[1]
 
@@ -193,12 +190,12 @@ def _best_levelling(pairs: Sequence[Pair]) -> Levelling:
     # a weighted sum of the variances of the polynomial coefficients over the scans.
     weights = np.mean(polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
     left = weights[1:] @ np.var(rests, axis=0)[1:]
-    return list(LEVELLED)[int(left.argmin())]
+    return [*LEVELLED][left.argmin()]
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
     """Return the number of the inner fold of each scan. The scans are dealt to the folds in the order of a
     hash of their ids.
     """
-    shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
-    return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])
+    keys = [drawing_key(scan_id, seed) for scan_id in ids]
+    return np.argsort(np.argsort(keys)) % min(_INNER_FOLDS, len(ids))
