@@ -50,8 +50,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     first, *columns = height.unbind(-1)[::forward]
     followed = [first]
     for column in columns:
-        error = column - followed[-1]
-        followed.append(followed[-1] + torch.where(error > 0, up, down) * error)
+        last = followed[-1]
+        followed.append(torch.lerp(last, column, torch.where(column > last, up, down)))
     late = torch.stack(followed[::forward], dim=-1)
     delay = forward * (length + rising) / 2
     return add_warp(late, 0.0, delay, pitch)

@@ -104,7 +104,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 
     Source: Lang 2022, arXiv:2205.14891, where shrinkage falls with dose.
     """
-    return height * (1 - values["fraction"] * (1 - context.dose_nearby(values["length_um"])))
+    return height * context.left_by_shrinkage(values["fraction"], values["length_um"])
 
 
 @of_development(
@@ -168,8 +168,7 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
-    closed = _closed_by(height, below)
-    return closed + (half_px - below) * (_closed_by(height, below + 1) - closed)
+    return torch.lerp(_closed_by(height, below), _closed_by(height, below + 1), half_px - below)
 
 
 def _closed_by(height: Tensor, half_px: int) -> Tensor:
@@ -181,18 +180,11 @@ def _closed_by(height: Tensor, half_px: int) -> Tensor:
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """Return the largest value in the square around each pixel, computed along one axis after the other. Each
-    step of the computation doubles the number of pixels that are included. The result leaves out the pixels
-    whose square extends beyond the field.
+    """Return the largest value in the square around each pixel, computed along one axis after the other. The
+    result leaves out the pixels whose square extends beyond the field.
     """
-    size = 2 * half_px + 1
     for axis in (-2, -1):
-        width = 1
-        while width < size:
-            shift = min(width, size - width)
-            left = field.shape[axis] - shift
-            field = torch.maximum(field.narrow(axis, 0, left), field.narrow(axis, shift, left))
-            width += shift
+        field = field.unfold(axis, 2 * half_px + 1, 1).amax(dim=-1)
     return field
 
 
