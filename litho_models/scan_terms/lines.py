@@ -75,7 +75,8 @@ def shrunk_line_offsets(
     freedom = np.maximum(blocks - 1, 0).sum()
     if freedom < 1 or line_mean.count() < 3:
         return np.zeros(line_count), np.zeros(line_count), 0.0
-    noise = (means.anom(axis=1) ** 2).sum() / freedom / np.ma.masked_equal(blocks, 0)
+    # Lines without blocks are masked.
+    noise = np.ma.divide((means.anom(axis=1) ** 2).sum() / freedom, blocks)
     variance = max(0.0, float(line_mean.var(ddof=1) - noise.mean()))
     weight = variance / np.maximum(variance + noise, np.finfo(float).tiny)
     return (weight * line_mean.anom()).filled(0), weight.filled(0), variance
