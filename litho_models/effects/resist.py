@@ -180,11 +180,18 @@ def _closed_by(height: Tensor, half_px: int) -> Tensor:
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """Return the largest value in the square around each pixel, computed along one axis after the other. The
-    result leaves out the pixels whose square extends beyond the field.
+    """Return the largest value in the square around each pixel, computed along one axis after the other. Each
+    step of the computation doubles the number of pixels that are included. The result leaves out the pixels
+    whose square extends beyond the field.
     """
+    size = 2 * half_px + 1
     for axis in (-2, -1):
-        field = field.unfold(axis, 2 * half_px + 1, 1).amax(dim=-1)
+        width = 1
+        while width < size:
+            shift = min(width, size - width)
+            left = field.shape[axis] - shift
+            field = torch.maximum(field.narrow(axis, 0, left), field.narrow(axis, shift, left))
+            width += shift
     return field
 
 
