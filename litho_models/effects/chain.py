@@ -71,10 +71,10 @@ class EffectChain(nn.Module):
                 cache.
             base_key: value that identifies the base if chains with different bases share the cache ``known``.
         """
-        if context is None and len(layout_um) > 1:
-            # A context describes a single field, and so do the formulas of many effects.
-            return torch.cat([self(one) for one in layout_um.split(1)])
         if context is None:
+            if len(layout_um) > 1:
+                # A context describes a single field, and so do the formulas of many effects.
+                return torch.cat([self(one) for one in layout_um.split(1)])
             assert isinstance(self.base, Simulator)
             geometry = self.base.config
             context = FieldContext(

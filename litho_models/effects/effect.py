@@ -116,61 +116,61 @@ class FieldContext:
         """
         count = max(1, round(self.full_height_um / self.slice_um))
         # The dose changes the exposure, not the number of slices.
-        number = (self.layout_um / (self.dose * self.slice_um))[0]
+        number = self.layout_um / (self.dose * self.slice_um)
         lower = torch.arange(count).to(number)[:, None, None, None]
         slices = self.dose * torch.clamp(number - lower, 0, 1)
         return add_blur(slices, _SLICED_VARIANCE_UM2, self.pitch_um, _SLICED_REACH_UM)
 
-    def dose_nearby(self, length_um: Tensor) -> Tensor:
-        """Return the mean nominal height around each pixel, as a fraction of the full height. The mean has
-        Gaussian weights with standard deviation ``length_um``. The result has shape (1, 1, ny, nx).
+    def left_by_shrinkage(self, fraction: Tensor, length_um: Tensor) -> Tensor:
+        """Return the share of the height that is left if a print shrinks more where its surroundings are
+        thin: 1 - k (1 - u). Here k is ``fraction``, and u is the mean nominal height nearby as a fraction of
+        the full height. The mean has Gaussian weights with standard deviation ``length_um``. The result has
+        shape (1, 1, ny, nx).
         """
-        return local_mean(self.layout_um / self.full_height_um, length_um, self.pitch_um)
+        nearby = local_mean(self.layout_um / self.full_height_um, length_um, self.pitch_um)
+        return 1 - fraction * (1 - nearby)
 
     def in_scan_frame(self) -> FieldContext:
         """Return this context rotated into the frame of the scan, in which the fast axis runs along x."""
-        turn = self.quarter_turns % 4
-        if not turn:
+        turns = self.quarter_turns % 4
+        if not turns:
             return self
-        (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
-        below, right = whole[0] - top - ny, whole[1] - left - nx
-        corners = [(top, left), (right, top), (below, right), (left, below)]
-        return replace(
+        (ny, nx), (top, left) = self.whole_shape(), self.origin_px
+        turned = replace(
             self,
-            layout_um=torch.rot90(self.layout_um, turn, (-2, -1)),
-            scan_shape=whole[::-1] if turn % 2 else whole,
-            origin_px=corners[turn],
-            quarter_turns=0,
+            layout_um=torch.rot90(self.layout_um, 1, (-2, -1)),
+            scan_shape=(nx, ny),
+            origin_px=(nx - left - self.layout_um.shape[-1], top),
+            quarter_turns=turns - 1,
         )
+        return turned.in_scan_frame()
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
         """Return the y and x positions of the pixels relative to the centre of the write field, µm. The two
         tensors have shapes (ny, 1) and (1, nx).
         """
-        rows, columns = pixel_numbers(self.layout_um)
-        (ny, nx), (top, left), (y, x) = self.whole_shape(), self.origin_px, self.field_centre_um
-        rows, columns = rows + top - (ny - 1) / 2, columns + left - (nx - 1) / 2
-        return rows * self.pitch_um + y, columns * self.pitch_um + x
+        axes = zip(self.scan_position(), self.whole_shape(), self.field_centre_um, strict=True)
+        y, x = (place * (size - 1) / 2 * self.pitch_um + centre for place, size, centre in axes)
+        return y, x
 
     def whole_shape(self) -> tuple[int, int]:
         """Return the numbers of rows and columns of the whole scan."""
-        return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
+        ny, nx = self.layout_um.shape[-2:]
+        return self.scan_shape or (ny, nx)
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
         """Return the y and x positions of the pixels relative to the whole scan. Each coordinate runs from -1
         to 1 over the whole scan. The two tensors have shapes (ny, 1) and (1, nx).
         """
-        rows, columns = pixel_numbers(self.layout_um)
-        (ny, nx), (top, left) = self.whole_shape(), self.origin_px
-        return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
+        axes = zip(pixel_numbers(self.layout_um), self.whole_shape(), self.origin_px, strict=True)
+        y, x = (2 * (number + first) / max(size - 1, 1) - 1 for number, size, first in axes)
+        return y, x
 
     def radius_um(self) -> float:
         """Return half the width of the write field, µm. If the dataset card (the TOML file that describes a
         campaign) states no write field, return half the longer side of the whole scan.
         """
-        if self.field_radius_um is not None:
-            return self.field_radius_um
-        return max(self.whole_shape()) * self.pitch_um / 2
+        return self.field_radius_um or max(self.whole_shape()) * self.pitch_um / 2
 
 
 Apply = Callable[[Tensor, Values, FieldContext], Tensor]
@@ -267,7 +267,7 @@ class Effect:
         """
         for name in values:
             require_known(f"parameter of {self.name}", name, self.parameters)
-        return {**{name: parameter.off for name, parameter in self.parameters.items()}, **values}
+        return {name: values.get(name, parameter.off) for name, parameter in self.parameters.items()}
 
     def require_in_range(self, values: Mapping[str, float]) -> None:
         """Check that all values are within their physical ranges.
@@ -308,8 +308,8 @@ class Effect:
         if self.of_tip and context.new_tip:
             return array
         if context.backward:
-            tensors = {name: -v if name in self.reverses else v for name, v in tensors.items()}
-        turn = context.quarter_turns % 4
+            tensors |= {name: -tensors[name] for name in self.reverses}
+        turn = context.quarter_turns
         seen = self.apply(torch.rot90(array, turn, (-2, -1)), tensors, context.in_scan_frame())
         return torch.rot90(seen, -turn, (-2, -1))
 

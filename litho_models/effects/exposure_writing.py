@@ -47,11 +47,10 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
 
     Source: Ellingen 2023, JOM 3(4) 043501.
     """
-    y, x = context.centred_um()
-    radius = context.radius_um()
-    tilt = values["tilt_x_um"] * x / radius + values["tilt_y_um"] * y / radius
-    surface = tilt + values["curvature_um"] * (x * x + y * y) / radius**2
-    return height + torch.where(context.layout_um > 0, surface, 0.0)
+    y, x = (place / context.radius_um() for place in context.centred_um())
+    tilt = values["tilt_x_um"] * x + values["tilt_y_um"] * y
+    surface = tilt + values["curvature_um"] * (x * x + y * y)
+    return height + (context.layout_um > 0) * surface
 
 
 @of_exposure(
@@ -92,8 +91,7 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     The printer searches for the interface before writing. Heights are clipped at the substrate.
     """
     substrate_um = values["substrate_um"]
-    thinned = values["shrinkage"] * (1 - context.dose_nearby(values["length_um"]))
-    lost_um = values["depth_um"] * (1 - thinned)
+    lost_um = values["depth_um"] * context.left_by_shrinkage(values["shrinkage"], values["length_um"])
     return torch.where(height > substrate_um, torch.maximum(height - lost_um, substrate_um), height)
 
 
@@ -213,4 +211,4 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     across_um = context.centred_um()["yx".index(context.slow_axis)]
     phase = 2 * math.pi * values["frequency_per_um"] * across_um
     ripple = values["cosine_um"] * torch.cos(phase) + values["sine_um"] * torch.sin(phase)
-    return height + torch.where(context.layout_um > 0, ripple, 0.0)
+    return height + (context.layout_um > 0) * ripple

@@ -7,7 +7,6 @@ Lengths are in pixels of the layout. These pixels are fine enough to resolve the
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation import Array
-from litho_models.effects.effect import FieldContext, Parameter, Values, entry
+from litho_models.effects.effect import (
+    FieldContext,
+    Parameter,
+    Values,
+    of_development,
+    of_exposure,
+    of_resist,
+)
 from litho_models.effects.filters import add_blur, add_scattered, add_warp, local_mean
 from litho_models.models.parts import etch
 
@@ -32,17 +38,14 @@ _BESIDE_PX = 0.75
 # A film is flat at all points that are farther than this from its edges.
 _FLAT_PX = 1.7
 
-_of_films = partial(entry, role="process", of_films=True)
 
-
-@_of_films(
+@of_exposure(
     "electrons scattered back from the substrate",
     {
         "weight": Parameter("1", 0.0, 1.5, 0.1),
         "length_px": Parameter("px", 8.0, 280.0, 25.0, "shape", tried=(14.0, 28.0, 56.0, 112.0)),
     },
-    stage="exposure",
-    acts_on="layout",
+    of_films=True,
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -53,11 +56,10 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     return add_scattered(layout, values["weight"], values["length_px"], 1.0)
 
 
-@_of_films(
+@of_resist(
     "reaction products spreading before the edge forms",
     {"variance_px2": Parameter("px²", 0.0, 150.0, 8.0, tried=(8.0, 45.0))},
-    stage="resist",
-    acts_on="height",
+    of_films=True,
     separating="write necks and islands of five widths, at two baking times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -78,11 +80,10 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     return height + edged(variance) - edged(0 * variance)
 
 
-@_of_films(
+@of_development(
     "edges shifted in etching or development",
     {"bias_px": Parameter("px", -8.0, 8.0, 1.4, tried=(1.0, -1.0))},
-    stage="development",
-    acts_on="height",
+    of_films=True,
     separating="write one layout at five doses; a bias does not depend on the dose",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -106,11 +107,10 @@ edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards
 _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
 
 
-@_of_films(
+@of_development(
     "edges shifted outwards by 2 M̄ - 1, which is 0 at a straight edge",
     {**etch_bias.parameters, "length_px": _DENSITY_PX},
-    stage="development",
-    acts_on="height",
+    of_films=True,
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:

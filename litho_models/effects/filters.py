@@ -20,8 +20,8 @@ _LEAST_SLOPE = 1e-3
 
 def pixel_numbers(field: Tensor) -> tuple[Tensor, Tensor]:
     """Return the row numbers and the column numbers of the pixels, of shapes (ny, 1) and (1, nx)."""
-    y, x = (torch.arange(n, dtype=field.dtype, device=field.device) for n in field.shape[-2:])
-    return y[:, None], x[None, :]
+    y, x = (torch.arange(n).to(field) for n in field.shape[-2:])
+    return y[:, None], x[None]
 
 
 def add_filtered(
@@ -122,10 +122,8 @@ def add_warp(
 
 
 def _moved(field: Tensor, shift_y_px: Tensor | float, shift_x_px: Tensor | float) -> Tensor:
-    (ny, nx), (rows, columns) = field.shape[-2:], pixel_numbers(field)
+    axes = zip(pixel_numbers(field), (shift_y_px, shift_x_px), field.shape[-2:], strict=True)
     # Coordinates run from -1 to 1 over the field.
-    x, y = torch.broadcast_tensors(
-        2 * (columns + shift_x_px) / max(nx - 1, 1) - 1, 2 * (rows + shift_y_px) / max(ny - 1, 1) - 1
-    )
-    grid = torch.stack([x, y], dim=-1).expand(len(field), ny, nx, 2)
+    y, x = (2 * (number + shift) / max(size - 1, 1) - 1 for number, shift, size in axes)
+    grid = torch.stack(torch.broadcast_tensors(x, y), dim=-1).expand(len(field), -1, -1, -1)
     return functional.grid_sample(field, grid, mode="bicubic", padding_mode="border", align_corners=True)

@@ -84,9 +84,9 @@ class Surface:
         """
         y, x = self.context.scan_position()
         if word == "rim":
-            sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
-            own_um = [side * (1 - one.abs()) for side, one in zip(sides_um, (y, x), strict=True)]
-            return torch.exp(-torch.minimum(*own_um) / self.values["length_um"]).to(self.h)
+            ny, nx = self.context.whole_shape()
+            inside_px = torch.minimum((1 - y.abs()) * (ny - 1) / 2, (1 - x.abs()) * (nx - 1) / 2)
+            return torch.exp(-self.context.pitch_um * inside_px / self.values["length_um"]).to(self.h)
         return {"x": x, "y": y, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
@@ -104,37 +104,32 @@ class Surface:
         """
         return local_mean(self.h if of is None else of, self.values["length_um"], self.context.pitch_um, 4)
 
-    def trailing(self, *signs: int) -> Tensor:
-        """Return the weighted mean height on one side of each pixel along the rotated x axis, or on both
-        sides. The weights decay exponentially with distance, with the decay length ``length_um`` of the law.
-
-        A sign of 1 stands for the side with smaller x, and -1 for the side with larger x.
+    def trailing(self, both_sides: bool) -> Tensor:
+        """Return the weighted mean height on both sides of each pixel along the rotated x axis, or only on
+        the side with smaller x. The weights decay exponentially with distance, with the decay length
+        ``length_um`` of the law.
         """
         length, pitch = self.values["length_um"], self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            along = self.along("x", fy, fx)
-            ways = [trailing_response(sign * along, length, pitch) for sign in signs]
-            return torch.stack(ways).mean(dim=0) - 1
+            response = trailing_response(self.along("x", fy, fx), length, pitch)
+            # The response of the other side is the complex conjugate.
+            return (response.real if both_sides else response) - 1
 
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * float(length.detach()))
-
-
-# A function that computes the map by which the strength of a law is multiplied. The map has shape (b, 1, ny,
-# nx).
-Column = Callable[[Surface], Tensor]
 
 
 def _law(
     name: str,
     formula: str,
     unit: str,
-    column: Column,
+    column: Callable[[Surface], Tensor],
     shapes: Mapping[str, Parameter] = {},
     on: ActsOn = "height",
 ) -> Effect:
     """Make a law from its name, its formula (as text), and the function ``column``, which computes the map
-    that is multiplied by the strength. ``unit`` is the unit of the strength.
+    that is multiplied by the strength. The map has shape (b, 1, ny, nx). ``unit`` is the unit of the
+    strength.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -155,8 +150,8 @@ def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
         phase = 2 * math.pi * values["frequency_per_um"] * field
         return field + values["sine_um"] * phase.sin() + values["cosine_um"] * (phase.cos() - 1)
 
-    amplitude, (lowest, *_, highest) = Parameter("µm", -0.2, 0.2, 0.02), tried
-    frequency = Parameter("1/µm", lowest, highest, 5.0, "shape", tried=tried)
+    amplitude = Parameter("µm", -0.2, 0.2, 0.02)
+    frequency = Parameter("1/µm", tried[0], tried[-1], 5.0, "shape", tried=tried)
     parameters = {"sine_um": amplitude, "cosine_um": amplitude, "frequency_per_um": frequency}
     return _nameless(
         f"{_FIELD[on]}-wave", f"a wave in the {_FIELD[on]} itself, sin(2π f h + phase)", parameters, apply, on
@@ -237,14 +232,17 @@ def _jumps(a: str) -> Iterator[Effect]:
     yield _law(f"{name}-y", f"∂h/∂y {formula}", "µm", lambda s: s.slope("y") * s.beyond(a), _POSITION)
 
 
-def _tail(name: str, sides: str, *signs: int) -> Effect:
+def _tail(name: str, sides: str, both_sides: bool) -> Effect:
     formula = f"(mean of D on {sides} along x over the length) - D"
-    law = _law(name, formula, "1", lambda s: s.trailing(*signs) - s.h, _TAIL, "layout")
-    typical = law.parameters["strength"].typical
+    law = _law(name, formula, "1", lambda s: s.trailing(both_sides) - s.h, _TAIL, "layout")
     # A tail on both sides looks the same after half a turn.
-    circle = 360 // len(signs)
+    circle = 180 if both_sides else 360
     trials = tuple(
-        {"strength": typical, "length_um": length_um, "turn_deg": float(turn_deg)}
+        {
+            "strength": law.parameters["strength"].typical,
+            "length_um": length_um,
+            "turn_deg": float(turn_deg),
+        }
         for length_um, step_deg in _TAILS.items()
         for turn_deg in range(-circle // 2, circle // 2, step_deg)
     )
@@ -272,8 +270,8 @@ _FOUND = [
     *map(_blurred_at, _WORDS),
     *_jumps("x"),
     *_jumps("y"),
-    _tail("dose-along", "both sides", 1, -1),
-    _tail("dose-from", "one side", 1),
+    _tail("dose-along", "both sides", both_sides=True),
+    _tail("dose-from", "one side", both_sides=False),
     _law(
         "dose-times-density",
         "D (mean of D within the length / full height)^power",

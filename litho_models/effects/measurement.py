@@ -50,8 +50,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     first, *columns = height.unbind(-1)[::forward]
     followed = [first]
     for column in columns:
-        error = column - followed[-1]
-        followed.append(followed[-1] + torch.where(error > 0, up, down) * error)
+        last = followed[-1]
+        followed.append(torch.lerp(last, column, torch.where(column > last, up, down)))
     late = torch.stack(followed[::forward], dim=-1)
     delay = forward * (length + rising) / 2
     return add_warp(late, 0.0, delay, pitch)
@@ -141,21 +141,20 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     last = height[..., -1:]
-    ahead = torch.cat([height[..., 1:], last], dim=-1)
     # Cubic polynomials through four neighbours give the heights half-way between pixels.
     near = functional.pad(height, (1, 1, 0, 0), mode="replicate").unfold(-1, len(_MIDDLE), 1)
     middles = torch.cat([near @ height.new_tensor(_MIDDLE), last], dim=-1)
-    # The pieces to the right of each pixel, then the pieces to the right of each mid-point.
-    begins = torch.stack([height, middles])
-    slopes = (torch.stack([middles, ahead]) - begins) / half_um
+    # The heights at which the pieces begin: at each pixel, and at the mid-point to the right of each pixel.
+    begins = torch.stack([height, middles], dim=-1).flatten(-2)
+    slopes = torch.diff(begins, append=last) / half_um
     steepest = float(slopes.detach().abs().max())
     # The tip cannot touch a point that is farther from its axis than R s, where s is the steepest slope. Nor
     # can it touch a point that is so far away that the parabola has risen there by more than the whole height
     # range.
     deepest_um = math.sqrt(2 * float((radius_um * (begins.max() - begins.min())).detach()))
     farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
-    reach_px = min(math.ceil(farthest_um / pitch_um) + 1, size)
-    edge = (reach_px, reach_px, 0, 0, 0, 0)
+    reach = 2 * min(math.ceil(farthest_um / pitch_um) + 1, size)
+    edge = (reach, reach, 0, 0)
     starts, rises = functional.pad(begins, edge, mode="replicate"), functional.pad(slopes, edge)
     # The gradient of the maximum is the gradient of the piece that the tip touches. The search for this piece
     # runs without gradients, because with gradients it would keep all pieces in memory.
@@ -163,18 +162,17 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
         touches = radius_um * rises
         bend = float(-0.5 / radius_um)
-        for offset in range(-2 * reach_px, 2 * reach_px):
-            away_px, middle = divmod(offset, 2)
+        for offset in range(-reach, reach):
             start, slope, touch = (
-                part[middle][..., reach_px + away_px :][..., :size] for part in (starts, rises, touches)
+                part[..., reach + offset :: 2][..., :size] for part in (starts, rises, touches)
             )
             near_um = offset * half_um
             touch = touch.clamp(near_um, near_um + half_um)
             tip = start.add(slope, alpha=-near_um).addcmul_(touch, slope.add(touch, alpha=bend))
             on.masked_fill_(tip > highest, offset)
             highest = torch.maximum(highest, tip)
-    piece = on + 2 * (torch.arange(size, device=height.device) + reach_px)
-    start, slope = (part.movedim(0, -1).flatten(-2).gather(-1, piece) for part in (starts, rises))
+    piece = on + 2 * torch.arange(size, device=height.device) + reach
+    start, slope = (part.gather(-1, piece) for part in (starts, rises))
     begins_um = on.to(height.dtype) * half_um
     touch = (radius_um * slope).clamp(begins_um, begins_um + half_um)
     return start + slope * (touch - begins_um) - touch**2 / (2 * radius_um)

@@ -104,7 +104,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 
     Source: Lang 2022, arXiv:2205.14891, where shrinkage falls with dose.
     """
-    return height * (1 - values["fraction"] * (1 - context.dose_nearby(values["length_um"])))
+    return height * context.left_by_shrinkage(values["fraction"], values["length_um"])
 
 
 @of_development(
@@ -168,8 +168,7 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
-    closed = _closed_by(height, below)
-    return closed + (half_px - below) * (_closed_by(height, below + 1) - closed)
+    return torch.lerp(_closed_by(height, below), _closed_by(height, below + 1), half_px - below)
 
 
 def _closed_by(height: Tensor, half_px: int) -> Tensor:

@@ -89,7 +89,7 @@ class PreparedScan:
         """Return the flat indices of the n pixels that are used for fits and screening. These pixels are a
         part of the measured pixels, without the pixels near the edge of the scan.
         """
-        return thinned(self._inner, _SAMPLED_PX)
+        return np.flatnonzero(thinned(self._inner, _SAMPLED_PX))
 
     @cached_property
     def height(self) -> np.ndarray:

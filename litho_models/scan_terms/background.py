@@ -7,9 +7,9 @@ belong to the printer, so designs do not use it.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import mode
 
 import numpy as np
 from pydantic import ConfigDict
@@ -31,12 +31,12 @@ Pair = tuple[PrintedScan, np.ndarray]
 
 @dataclass(frozen=True, repr=False)
 class ScanPart(PrintedScan):
-    """A rectangular part of a scan. ``whole`` is the shape (ny, nx) of the scan, and ``corner`` is the row
-    and the column of the part's first pixel in the scan.
+    """A rectangular part of a scan. ``whole`` is the shape (ny, nx) of the scan, and ``area`` contains the
+    rows and columns of the scan that the part shows.
     """
 
     whole: tuple[int, int] = (0, 0)
-    corner: tuple[int, int] = (0, 0)
+    area: tuple[slice, slice] = (slice(0), slice(0))
 
 
 class Background(Record):
@@ -87,8 +87,7 @@ def on_field(scan: PrintedScan, maps: Callable[[tuple[int, int]], FloatMap]) -> 
     """
     if not isinstance(scan, ScanPart):
         return maps(scan.shape)
-    (top, left), (ny, nx) = scan.corner, scan.shape
-    return maps(scan.whole)[..., top : top + ny, left : left + nx]
+    return maps(scan.whole)[..., *scan.area]
 
 
 def of_usual_size(
@@ -97,14 +96,14 @@ def of_usual_size(
     """Return the most frequent size (y, x) of the scans' fields, µm, and those of the scans whose fields have
     this size, each with the predicted height of its print.
     """
-    usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
+    usual_um = mode(map(field_um, scans))
     pairs = zip(scans, predictions_um, strict=True)
     return usual_um, [pair for pair in pairs if is_of_size(pair[0], usual_um)]
 
 
 def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
     """Return whether a scan's field has the size (y, x) given in µm, within 1 %."""
-    return bool(np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0))
+    return np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0)
 
 
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
@@ -127,10 +126,10 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
     for scan, prediction in pairs:
         usable = scan.usable
         coefficients, _ = fitted_terms(scan.height_um, prediction, usable, POLICIES["full"])
-        own = np.tensordot(coefficients[2:], smooth_shapes(scan.shape), axes=1)
+        own = coefficients[2:] @ smooth_shapes(scan.shape)[:, usable]
         shapes = on_field(scan, smooth_shapes)[:, usable]
-        shapes = shapes - shapes.mean(axis=1, keepdims=True)
+        shapes -= shapes.mean(axis=1, keepdims=True)
         products += shapes @ shapes.T
-        seen += shapes @ own[usable]
+        seen += shapes @ own
     x, y, xx, xy, yy = (NM_PER_UM * np.linalg.lstsq(products, seen, rcond=1e-12)[0]).tolist()
     return Background(x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=usual_um, scans=len(pairs))

@@ -98,17 +98,16 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
     for sides in product((False, True), repeat=len(axes)):
         score, other_side = np.ones(shape, bool), {}
         for axis, second in zip(axes, sides, strict=True):
-            at, middle = np.expand_dims(np.arange(shape[axis]), 1 - axis), shape[axis] // 2
+            at, middle = np.indices(shape)[axis], shape[axis] // 2
             score &= (at >= middle) == second
-            beyond = at < middle - gap_px if second else at >= middle + gap_px
-            other_side[axis] = np.broadcast_to(beyond, shape)
+            other_side[axis] = at < middle - gap_px if second else at >= middle + gap_px
         cells.append(Cell(score, other_side))
     return cells
 
 
-def thinned(used: BoolMap, count: int) -> NDArray[np.intp]:
-    """Select about ``count`` of the used pixels, on a square lattice, and return their flat indices."""
+def thinned(used: BoolMap, count: int) -> BoolMap:
+    """Select about ``count`` of the used pixels, on a square lattice, and return the mask of these pixels."""
     stride = max(1, round((used.sum() / count) ** 0.5))
     lattice = np.zeros_like(used)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    return np.flatnonzero(used & lattice)
+    return used & lattice

@@ -80,7 +80,7 @@ def cross_fit(
     bad = int(np.sum(~np.isfinite(prediction[usable])))
     if bad:
         raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="finite heights")
-    difference = np.where(usable, height - prediction, 0.0)
+    difference = height - prediction
     residual = np.full(height.shape, np.nan)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
     lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines]
@@ -115,8 +115,7 @@ def fitted_terms(
     ``cross_fit``, which fits the terms to pixels that are not scored.
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
-    target = (height_um - prediction_um)[used].astype(np.float64)
-    coefficients = least_squares(basis[:, used], target)
+    coefficients = least_squares(basis[:, used], (height_um - prediction_um)[used])
     return coefficients, np.tensordot(coefficients, basis, axes=1)
 
 
@@ -124,8 +123,8 @@ def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, te
     """Return the measured height minus the predicted height minus the terms that ``fitted_terms`` fits, µm.
     The result has shape (ny, nx) and is 0 at unused pixels.
     """
-    _, own = fitted_terms(height_um, prediction_um, used, terms)
-    return np.where(used, height_um - prediction_um - own, 0.0)
+    added = prediction_um + fitted_terms(height_um, prediction_um, used, terms)[1]
+    return np.where(used, height_um - added, 0.0)
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:

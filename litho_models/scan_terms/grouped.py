@@ -9,8 +9,9 @@ these strengths leave in any other scans.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,7 +23,6 @@ ALL = "all"
 # distinguished from an effect of this scan alone.
 FEWEST_IN_GROUP = 2
 _STATED = ("tip", "direction", "turned_deg")
-_ORDER, _CHARACTER = "order", "character"
 
 
 def label_of(scan: PrintedScan, by: str) -> str:
@@ -42,13 +42,13 @@ def label_of(scan: PrintedScan, by: str) -> str:
         stated = getattr(scan, by)
         return "" if stated is None else f"{stated:g}"
     # Names of groups in the card contain no spaces.
-    kind, _, value = by.partition(" ")
-    if value and kind == _ORDER:
-        last, first = map(int, value.split("-"))
-        # For a scan between these two positions, it is not known whether it lies before or after the change.
-        return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
-    if value and kind == _CHARACTER:
-        return scan.id[int(value) - 1 : int(value)]
+    match by.split():
+        case ["order", positions]:
+            last, first = map(int, positions.split("-"))
+            # For a scan between these positions, it is not known whether it lies before or after the change.
+            return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
+        case ["character", position]:
+            return scan.id[int(position) - 1 : int(position)]
     return ""
 
 
@@ -67,45 +67,42 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [*stated, "print", *_STATED]
     if len({len(scan.id) for scan in scans}) == 1:
-        names += [f"{_CHARACTER} {at}" for at in range(1, len(scans[0].id) + 1)]
+        names += [f"character {at}" for at in range(1, len(scans[0].id) + 1)]
     found: dict[str, Labels] = {ALL: ("",) * len(scans)}
-    for name in names:
-        labels = tuple(label_of(scan, name) for scan in scans)
-        if _is_grouped(labels) and not _is_known(labels, found):
-            found[name] = labels
-    if by_order:
-        for first in _places(scans, "print" in found):
-            last = max(scan.order for scan in scans if scan.order < first)
-            name = f"{_ORDER} {last}-{first}"
+
+    def add(names: Iterable[str]) -> None:
+        for name in names:
             labels = tuple(label_of(scan, name) for scan in scans)
-            if not _is_known(labels, found):
+            counts = Counter(labels).values()
+            grouped = 1 < len(counts) <= 2 * sum(count >= FEWEST_IN_GROUP for count in counts)
+            if grouped and _division(labels) not in map(_division, found.values()):
                 found[name] = labels
+
+    add(names)
+    if by_order:
+        add(f"order {last}-{first}" for last, first in _places(scans, "print" in found))
     return found
 
 
-def _is_grouped(labels: Labels) -> bool:
-    counts = Counter(labels).values()
-    return len(counts) > 1 and 2 * sum(count >= FEWEST_IN_GROUP for count in counts) >= len(counts)
-
-
-def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
-    """Return whether a grouping divides the scans in the same way as one of the groupings found so far. The
-    names of the labels do not matter.
+def _division(labels: Labels) -> list[int]:
+    """Return, for each scan, the index of the first scan with the same label. Groupings that divide the scans
+    in the same way have the same result, whatever the names of their labels.
     """
-    return any(
-        len(set(zip(labels, own, strict=True))) == len(set(labels)) == len(set(own)) for own in found.values()
-    )
+    return [*map(labels.index, labels)]
 
 
-def _places(scans: Sequence[PrintedScan], by_print: bool) -> list[int]:
-    """Return the positions in the printing order at which something may have changed. If it is known which
-    scan belongs to which print, these are the positions between prints. Otherwise, they are all positions
-    with at least two scans before and two scans after them.
+def _places(scans: Sequence[PrintedScan], by_print: bool) -> list[tuple[int, int]]:
+    """Return the places in the printing order at which something may have changed. Each place is given by the
+    positions of the last scan before it and of the first scan after it. If it is known which scan belongs to
+    which print, these are the places between prints. Otherwise, they are all places with at least two
+    positions before and two positions after them.
     """
-    if by_print:
-        prints = {scan.print_id for scan in scans}
-        return sorted({min(s.order for s in scans if s.print_id == own) for own in prints})[1:]
-    return sorted({scan.order for scan in scans})[FEWEST_IN_GROUP : 1 - FEWEST_IN_GROUP]
+    places = [*pairwise(sorted({scan.order for scan in scans}))]
+    if not by_print:
+        return places[FEWEST_IN_GROUP - 1 : 1 - FEWEST_IN_GROUP]
+    prints = {scan.print_id for scan in scans}
+    firsts = {min(scan.order for scan in scans if scan.print_id == own) for own in prints}
+    return [place for place in places if place[1] in firsts]
 
 
 # Strengths of a block's columns, keyed by the label of a group.
@@ -191,14 +188,11 @@ class Products:
 
         If a block has no strengths for the label of a scan, the block is not subtracted from this scan.
         """
-        residual = np.eye(1, self.grams.shape[1])[0]
         left = np.empty(len(scans))
         for at, scan in enumerate(scans):
-            rest = residual.copy()
+            rest = np.eye(1, self.grams.shape[1])[0]
             for block, known in zip(blocks, strengths, strict=True):
-                own = known.get(self.groups[block.by][scan])
-                if own is not None:
-                    rest[list(block.columns)] -= own
+                rest[list(block.columns)] -= known.get(self.groups[block.by][scan], 0.0)
             left[at] = rest @ self.grams[scan] @ rest
         return left
 

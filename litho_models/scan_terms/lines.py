@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from litho_data.register import Bend
+from litho_data.register.geometry import index_to_um, warped_grid
 from litho_models.scan_terms.blocks import BoolMap
 from litho_models.scan_terms.term import FloatMap, LineIndex
-
-if TYPE_CHECKING:
-    from litho_data.register import Bend
 
 
 def scan_line_index(
@@ -26,14 +23,11 @@ def scan_line_index(
         pitch_um: size of a layout pixel. The distance between scan lines is assumed to equal this size.
         bend_um: bend of the scan, which ``scan_to_layout`` does not contain; None if the scan is not bent.
     """
-    y, x = (np.indices(shape) + 0.5) * pitch_um
-    inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
-    scan_x, scan_y, depth = (row[0] * x + row[1] * y + row[2] for row in inverse)
-    scan_x, scan_y = scan_x / depth, scan_y / depth
+    to_scan = np.linalg.inv(scan_to_layout) @ index_to_um((pitch_um, pitch_um))
+    scan_y, _ = warped_grid(to_scan, shape, bend_um)
     if bend_um is not None:
         # Pixels outside the scan belong to its first or last line.
-        end = 2 * bend_um.half[1] * (1 - 1e-9)
-        scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, end)
+        scan_y = np.clip(scan_y, 0, 2 * bend_um.half[1] * (1 - 1e-9))
     line = np.floor(scan_y / pitch_um).astype(np.intp)
     return line - line.min()
 
@@ -42,7 +36,7 @@ def axis_along(line: LineIndex) -> int:
     """Return the array axis along which the lines run. It is 1 for lines along x, and 0 for lines along y.
     Lines along y occur in scans that are rotated by 90 degrees.
     """
-    down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
+    down, across = (np.abs(np.diff(line, axis=axis)).mean() for axis in (0, 1))
     return int(down >= across)
 
 
@@ -76,16 +70,13 @@ def shrunk_line_offsets(
         for weights in (None, residual_um[used])
     )
     # Blocks with few pixels (at the edge of the scan) are left out, because all blocks have equal weight.
-    filled = count >= max(1, count.max() // 2)
-    means = np.where(filled, total / np.maximum(count, 1), 0.0)
-    blocks = filled.sum(axis=1)
-    line_mean = means.sum(axis=1) / np.maximum(blocks, 1)
-    within = (np.where(filled, means - line_mean[:, None], 0.0) ** 2).sum()
+    means = np.ma.masked_where(count < max(1, count.max() // 2), total) / np.maximum(count, 1)
+    blocks, line_mean = means.count(axis=1), means.mean(axis=1)
     freedom = np.maximum(blocks - 1, 0).sum()
-    seen = blocks > 0
-    if freedom < 1 or seen.sum() < 3:
+    if freedom < 1 or line_mean.count() < 3:
         return np.zeros(line_count), np.zeros(line_count), 0.0
-    noise = within / freedom / np.maximum(blocks, 1)
-    variance = max(0.0, float(np.var(line_mean[seen], ddof=1) - noise[seen].mean()))
-    weight = np.where(seen, variance / np.maximum(variance + noise, np.finfo(float).tiny), 0.0)
-    return weight * (line_mean - line_mean[seen].mean()), weight, variance
+    # Lines without blocks are masked.
+    noise = np.ma.divide((means.anom(axis=1) ** 2).sum() / freedom, blocks)
+    variance = max(0.0, float(line_mean.var(ddof=1) - noise.mean()))
+    weight = variance / np.maximum(variance + noise, np.finfo(float).tiny)
+    return (weight * line_mean.anom()).filled(0), weight.filled(0), variance

@@ -9,7 +9,6 @@ scored scan. The measurement model is not part of the printer and is not used in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
@@ -62,11 +61,6 @@ class SharedPart(Record):
     shrinking: float
     coefficients: dict[str, list[float]]
 
-    @property
-    def numbers(self) -> int:
-        """Return the number of fitted coefficients."""
-        return sum(len(own) for own in self.coefficients.values())
-
     def of(self, scan: PrintedScan) -> list[float]:
         """Return the coefficients of the group to which the scan belongs. The list is empty if this group has
         no coefficients.
@@ -102,7 +96,7 @@ class MeasurementModel(Record):
     @property
     def numbers(self) -> int:
         """Return the number of fitted coefficients."""
-        return sum(part.numbers for part in self.parts)
+        return sum(len(own) for part in self.parts for own in part.coefficients.values())
 
     def fits(self, scan: PrintedScan) -> bool:
         """Return whether the field of the scan is as large as the fields of the training scans."""
@@ -115,9 +109,8 @@ class MeasurementModel(Record):
         If the field of the scan differs in size from the fields of the training scans, only the levelling is
         applied.
         """
-        parts = self._parts(scan)
-        seen = displaced(scan, prediction_um, parts)
-        for part in parts:
+        seen = self.displaced_um(scan, prediction_um)
+        for part in self.parts_of(scan):
             if part.what == "gain":
                 seen = seen + part.of(scan)[0] * (seen - seen.mean())
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
@@ -145,28 +138,27 @@ class MeasurementModel(Record):
             kept.append(part.model_copy(update={"coefficients": own}))
         return self.model_copy(update={"parts": kept, "levelling": "none"})
 
+    def displaced_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
+        """Return the predicted height of the print with the displacements of this model. Both maps have shape
+        (ny, nx) and are in µm.
+        """
+        prediction = np.asarray(prediction_um, np.float64)
+        moves = [part for part in self.parts_of(scan) if part.what in _SHIFTS]
+        if not moves:
+            return prediction
+        places = np.indices(scan.shape, np.float64)
+        for part in moves:
+            places[_SHIFTS.index(part.what)] += part.map_um(scan) / scan.pitch_um
+        return map_coordinates(prediction, places, order=3, mode="nearest")
+
     def background_um(self, scan: PrintedScan) -> FloatMap:
         """Return the background on the field of the scan, µm, of shape (ny, nx)."""
-        backgrounds = (part for part in self._parts(scan) if part.what == "background")
+        backgrounds = (part for part in self.parts_of(scan) if part.what == "background")
         return sum((part.map_um(scan) for part in backgrounds), np.zeros(scan.shape))
 
-    def _parts(self, scan: PrintedScan) -> list[SharedPart]:
+    def parts_of(self, scan: PrintedScan) -> list[SharedPart]:
         """Return the parts that apply to the scan; there are none if its field has another size."""
         return [part for part in self.parts if part.of(scan)] if self.fits(scan) else []
-
-
-def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Displace a predicted height map. Parts that are not displacements are ignored. The height map and the
-    result have shape (ny, nx) and are in µm.
-    """
-    prediction = np.asarray(prediction_um, np.float64)
-    moves = [part for part in parts if part.what in _SHIFTS]
-    if not moves:
-        return prediction
-    places = np.indices(scan.shape, np.float64)
-    for part in moves:
-        places[_SHIFTS.index(part.what)] += part.map_um(scan) / scan.pitch_um
-    return map_coordinates(prediction, places, order=3, mode="nearest")
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:

@@ -23,28 +23,21 @@ from litho_models.scan_terms.measurement import (
     MeasurementModel,
     Shared,
     SharedPart,
-    displaced,
     polynomial_count,
     polynomials,
 )
 from litho_models.scan_terms.term import FloatMap
 
 _HIGHEST, _LATERAL = 11, 3
-# The parts to try, starting with the most likely part. Each part is given by its kind, its polynomial degree,
-# and whether its coefficients differ by group. In a field of 54 µm, a background of degree 11 varies over
-# lengths down to 9 µm.
-_OFFERS: tuple[tuple[Shared, int, bool], ...] = (
-    ("background", 2, False),
-    ("background", 4, False),
-    ("background", _HIGHEST, False),
-    ("background", 3, True),
-    ("background", _HIGHEST, True),
-    ("shift-x", _LATERAL, False),
-    ("shift-x", _LATERAL, True),
-    ("shift-y", _LATERAL, False),
-    ("shift-y", _LATERAL, True),
-    ("gain", 0, True),
-)
+# The polynomial degrees to try for each kind of part: for parts that are the same in all scans, and for parts
+# whose coefficients differ by group. In a field of 54 µm, a background of degree 11 varies over lengths down
+# to 9 µm.
+_FOR_ALL: dict[Shared, list[int]] = {
+    "background": [2, 4, _HIGHEST],
+    "shift-x": [_LATERAL],
+    "shift-y": [_LATERAL],
+}
+_FOR_GROUPS: dict[Shared, list[int]] = {**_FOR_ALL, "background": [3, _HIGHEST], "gain": [0]}
 # Weights to try for the prior that pulls the coefficients of every group towards zero. A prior with the
 # weight w weighs as much as w scans. The ideal weight is the variance within groups divided by the variance
 # between groups.
@@ -82,11 +75,10 @@ def learn_measurement(
             coefficients of these parts are fitted again.
     """
     usual_um, pairs = of_usual_size(scans, predictions_um)
-    model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     if scans[0].seen_by == "sem":
-        return model
+        return MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     levelling = like.levelling if like else _best_levelling(pairs)
-    model = model.model_copy(update={"levelling": levelling, "scans": len(pairs)})
+    model = MeasurementModel(levelling=levelling, parts=[], field_um=usual_um, scans=len(pairs))
     groups = groupings([scan for scan, _ in pairs], by_order=False)
     chosen = like.parts if like else None
     for _ in range(_ROUNDS):
@@ -108,14 +100,14 @@ def _chosen(products: Products, fold_of: np.ndarray) -> list[SharedPart]:
         return chosen
     left = products.held_out([], fold_of)
     while offers := _offers(products.groups, chosen):
-        tried = [products.held_out([*map(_block, (*chosen, one))], fold_of) for one in offers]
-        best = int(np.argmin([one.mean() for one in tried]))
-        gain = left - tried[best]
+        tried = (products.held_out([*map(_block, (*chosen, one))], fold_of) for one in offers)
+        best, rest = min(zip(offers, tried, strict=True), key=lambda pair: pair[1].mean())
+        gain = left - rest
         error = gain.std(ddof=1) / np.sqrt(len(gain))
         if gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
             break
-        chosen.append(offers[best])
-        left = tried[best]
+        chosen.append(best)
+        left = rest
     return chosen
 
 
@@ -123,10 +115,11 @@ def _offers(groups: Iterable[str], chosen: Sequence[SharedPart]) -> list[SharedP
     taken = {(part.what, part.by) for part in chosen}
     return [
         SharedPart(what=what, by=by, degree=degree, shrinking=shrinking, coefficients={})
-        for what, degree, grouped in _OFFERS
         for by in groups
-        if (by != ALL) == grouped and (what, by) not in taken
-        for shrinking in (_SHRINKING if grouped else _SHRINKING[:1])
+        for what, degrees in (_FOR_ALL if by == ALL else _FOR_GROUPS).items()
+        if (what, by) not in taken
+        for degree in degrees
+        for shrinking in (_SHRINKING[:1] if by == ALL else _SHRINKING)
     ]
 
 
@@ -152,19 +145,18 @@ def _gram(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     shrinks the coefficients only once, however many rounds there are.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
-    seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
-    slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
-    shapes = polynomials(scan.shape, _HIGHEST).reshape(polynomial_count(_HIGHEST), -1).take(at, axis=1)
+    seen = model.displaced_um(scan, prediction_um)
+    slope_y, slope_x = np.array(np.gradient(seen, scan.pitch_um))[:, at]
+    shapes = polynomials(scan.shape, _HIGHEST)[:, at]
     lateral = shapes[: polynomial_count(_LATERAL)]
-    moved = np.stack([*lateral * slope_x, *lateral * slope_y, seen.reshape(-1)[at]])
+    moved = np.stack([*lateral * slope_x, *lateral * slope_y, seen[at]])
     # The background is added after levelling, so the columns of the background are not levelled.
     surface = shapes[[0, *LEVELLED[model.levelling]]]
     moved -= least_squares(surface, moved.T).T @ surface
-    residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
+    residual = (scan.height_um - model.expected_um(scan, prediction_um))[at]
     rows = np.stack([residual, *shapes[1:], *moved])
-    for part in model.parts:
-        if known := part.of(scan):
-            rows[0] += known @ rows[list(_block(part).columns)]
+    for part in model.parts_of(scan):
+        rows[0] += part.of(scan) @ rows[list(_block(part).columns)]
     rows -= rows.mean(axis=1, keepdims=True)
     return rows @ rows.T / rows.shape[1]
 
@@ -186,26 +178,24 @@ def _best_levelling(pairs: Sequence[Pair]) -> Levelling:
     """Choose the levelling with which the predictions fit the scans best. The bow and tilt that all scans
     share are first removed.
     """
-    rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}
+    rests = []
     for scan, prediction in pairs:
         at = thinned(scan.usable, _SAMPLED_PX)
-        shapes = polynomials(scan.shape, 2).reshape(polynomial_count(2), -1)[:, at]
-        height, expected = (
-            np.asarray(one, np.float64).reshape(-1)[at] for one in (scan.height_um, prediction)
-        )
-        for levelling, own in LEVELLED.items():
-            surface = shapes[[0, *own]]
-            seen = expected - least_squares(surface, expected) @ surface
-            rests[levelling].append(least_squares(shapes, height - seen))
+        shapes = polynomials(scan.shape, 2)[:, at]
+        height, expected = (one[at].astype(np.float64) for one in (scan.height_um, prediction))
+        surfaces = (shapes[[0, *own]] for own in LEVELLED.values())
+        seen = [expected - least_squares(surface, expected) @ surface for surface in surfaces]
+        rests.append(least_squares(shapes, (height - seen).T))
     # Legendre polynomials are nearly orthogonal over a field, so the squared error that a levelling leaves is
     # a weighted sum of the variances of the polynomial coefficients over the scans.
     weights = np.mean(polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
-    return min(LEVELLED, key=lambda one: float((np.var(rests[one], axis=0) * weights)[1:].sum()))
+    left = weights[1:] @ np.var(rests, axis=0)[1:]
+    return [*LEVELLED][left.argmin()]
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
     """Return the number of the inner fold of each scan. The scans are dealt to the folds in the order of a
     hash of their ids.
     """
-    shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
-    return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])
+    keys = [drawing_key(scan_id, seed) for scan_id in ids]
+    return np.argsort(np.argsort(keys)) % min(_INNER_FOLDS, len(ids))

@@ -77,7 +77,7 @@ class NuisanceProtocol(Record):
     def of_policy(cls, policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
         """Return the protocol of a policy, with the standard blocks."""
         k = float(len(parameter_names(policy_terms(policy))))
-        return cls(policy=policy, k=k, background=background, **Blocks(seed=seed)._asdict())
+        return cls(policy=policy, k=k, seed=seed, background=background)
 
     @property
     def blocks(self) -> Blocks:
@@ -118,23 +118,19 @@ def estimate_scan_terms(
     Use these maps only for training. For errors that are reported, use ``cross_fit``, which fits the terms to
     pixels that are not scored.
     """
-    coefficients = np.array(
-        [
-            fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]
-            for scan, prediction in zip(scans, predictions_um, strict=True)
-        ]
-    )
+    fits = [
+        fitted_terms(scan.height_um, prediction, scan.usable, terms)
+        for scan, prediction in zip(scans, predictions_um, strict=True)
+    ]
     # Offset and gain are the first terms of the catalogue and have one map each, so their coefficients come
     # first.
-    pinned = len(PINNED & terms)
-    coefficients[:, :pinned] -= coefficients[:, :pinned].mean(axis=0)
+    pinned = PINNED & terms
+    means = np.mean([coefficients[: len(pinned)] for coefficients, _ in fits], axis=0)
     maps = []
-    for scan, prediction, own in zip(scans, predictions_um, coefficients, strict=True):
-        basis = term_maps(TermPixels(prediction), terms).reshape(-1, *scan.shape)
-        smooth = np.tensordot(own, basis, axes=1)
+    for scan, prediction, (_, own) in zip(scans, predictions_um, fits, strict=True):
+        added = own - (means @ term_maps(TermPixels(prediction), pinned)).reshape(scan.shape)
         if line_terms(terms):
-            rows = row_index(scan.shape)
-            residual = np.where(scan.usable, scan.height_um - prediction - smooth, 0.0)
-            smooth = smooth + shrunk_line_offsets(residual, scan.usable, rows, Blocks().block_px)[0][rows]
-        maps.append(smooth.astype(np.float32))
+            rows, residual = row_index(scan.shape), scan.height_um - prediction - added
+            added += shrunk_line_offsets(residual, scan.usable, rows, Blocks().block_px)[0][rows]
+        maps.append(added.astype(np.float32))
     return maps

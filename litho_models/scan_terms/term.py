@@ -161,8 +161,7 @@ def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
     """Return maps of x, y, x², xy and y² over a scan, where x and y run from -1 to 1. The mean of each map is
     subtracted. The result has shape (5, ny, nx) and is read-only.
     """
-    ny, nx = shape
-    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     shapes = np.stack([term - term.mean() for term in (x, y, x * x, x * y, y * y)])
     shapes.setflags(write=False)
     return shapes
@@ -198,55 +197,56 @@ def _distortion(pixels: TermPixels) -> FloatMap:
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
 # The terms are listed in the order in which the loop tests them.
-_BUILT_IN = (
-    ScanTerm("offset", "datum-offset", "µm", ("offset",), maps=lambda p: np.ones((1, len(p.height)))),
-    ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None]),
-    ScanTerm("bow", "tilt-bow", "µm", ("x", "y", "x²", "xy", "y²"), maps=lambda p: p.smooth),
-    ScanTerm(
-        "drift",
-        "slow-drift",
-        "µm",
-        tuple(f"creep over {decay:g} of the scan" for decay in CREEP_DECAYS.values()),
-        maps=_drift,
-    ),
-    ScanTerm(
-        "warp",
-        "registration-residual",
-        "px",
-        tuple(f"shift {axis}{by}" for axis in "yx" for by in ("", " by y", " by x")),
-        maps=_warp,
-    ),
-    ScanTerm(
-        "distortion",
-        "registration-residual",
-        "px",
-        tuple(f"shift {axis} by {by}" for axis in "yx" for by in ("y² - 1/3", "xy", "x² - 1/3")),
-        maps=_distortion,
-    ),
-    ScanTerm(
-        "scan-lines",
-        "scan-line-stripes",
-        "µm",
-        ("offset of a scan line",),
-        lines=lambda shape, line: row_index(shape) if line is None else line,
-        frame="the scan lines",
-    ),
-    ScanTerm(
-        "layout-rows",
-        "line-roughness",
-        "µm",
-        ("offset of a row",),
-        lines=lambda shape, line: row_index(shape),
-        frame="the layout's rows",
-    ),
-    ScanTerm(
-        "layout-columns",
-        None,
-        "µm",
-        ("offset of a column",),
-        lines=lambda shape, line: row_index(shape[::-1]).T,
-        frame="the layout's columns",
-    ),
-)
-
-SCAN_TERMS: dict[str, ScanTerm] = {term.name: term for term in _BUILT_IN}
+SCAN_TERMS: dict[str, ScanTerm] = {
+    term.name: term
+    for term in (
+        ScanTerm("offset", "datum-offset", "µm", ("offset",), maps=lambda p: np.ones((1, len(p.height)))),
+        ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None]),
+        ScanTerm("bow", "tilt-bow", "µm", ("x", "y", "x²", "xy", "y²"), maps=lambda p: p.smooth),
+        ScanTerm(
+            "drift",
+            "slow-drift",
+            "µm",
+            tuple(f"creep over {decay:g} of the scan" for decay in CREEP_DECAYS.values()),
+            maps=_drift,
+        ),
+        ScanTerm(
+            "warp",
+            "registration-residual",
+            "px",
+            tuple(f"shift {axis}{by}" for axis in "yx" for by in ("", " by y", " by x")),
+            maps=_warp,
+        ),
+        ScanTerm(
+            "distortion",
+            "registration-residual",
+            "px",
+            tuple(f"shift {axis} by {by}" for axis in "yx" for by in ("y² - 1/3", "xy", "x² - 1/3")),
+            maps=_distortion,
+        ),
+        ScanTerm(
+            "scan-lines",
+            "scan-line-stripes",
+            "µm",
+            ("offset of a scan line",),
+            lines=lambda shape, line: row_index(shape) if line is None else line,
+            frame="the scan lines",
+        ),
+        ScanTerm(
+            "layout-rows",
+            "line-roughness",
+            "µm",
+            ("offset of a row",),
+            lines=lambda shape, line: row_index(shape),
+            frame="the layout's rows",
+        ),
+        ScanTerm(
+            "layout-columns",
+            None,
+            "µm",
+            ("offset of a column",),
+            lines=lambda shape, line: row_index(shape[::-1]).T,
+            frame="the layout's columns",
+        ),
+    )
+}

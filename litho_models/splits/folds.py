@@ -201,7 +201,7 @@ def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]
 
 
 def _quadrant(scan: PrintedScan, crop: Crop) -> PrintedScan:
-    rows, columns = area = crop.slices(scan.shape)
+    area = crop.slices(scan.shape)
     sigma_um = scan.height_sigma_um
     cut = {
         "id": f"{scan.id}/{crop.quadrant}",
@@ -210,4 +210,4 @@ def _quadrant(scan: PrintedScan, crop: Crop) -> PrintedScan:
         "valid": scan.valid[area],
         "height_sigma_um": None if sigma_um is None else sigma_um[area],
     }
-    return ScanPart(**(vars(scan) | cut), whole=scan.shape, corner=(rows.start, columns.start))
+    return ScanPart(**(vars(scan) | cut), whole=scan.shape, area=area)

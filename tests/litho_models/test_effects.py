@@ -363,6 +363,17 @@ def test_the_gradient_of_a_dilation_is_that_of_the_piece_on_which_the_tip_stands
     )
 
 
+def test_a_tip_dilates_a_mirrored_surface_to_the_mirror_image() -> None:
+    """Check a tip that touches only points within half a pixel, at the edges of the field as well."""
+    draw = torch.Generator().manual_seed(6)
+    surface = 0.2 * torch.rand(1, 1, 9, 12, generator=draw, dtype=torch.float64)
+    dilated, mirrored = (
+        get_effect("tip-dilation")(one, {"radius_um": 0.02}, FieldContext(one, PITCH_UM, 1.2))
+        for one in (surface, surface.flip(-1, -2))
+    )
+    assert torch.allclose(dilated, mirrored.flip(-1, -2), rtol=0, atol=1e-12)
+
+
 def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
     # The maximum over u of a (1 - (x - u)² / w²) - u² / 2R is again a parabola, with curvature 1/(q + R)
     # instead of 1/q, q = w² / 2a. Straight pieces of half a pixel lie at most (dx/2)² / 8q below it.
