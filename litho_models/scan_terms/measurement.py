@@ -61,6 +61,11 @@ class SharedPart(Record):
     shrinking: float
     coefficients: dict[str, list[float]]
 
+    @property
+    def numbers(self) -> int:
+        """Return the number of fitted coefficients."""
+        return sum(len(own) for own in self.coefficients.values())
+
     def of(self, scan: PrintedScan) -> list[float]:
         """Return the coefficients of the group to which the scan belongs. The list is empty if this group has
         no coefficients.
@@ -96,7 +101,7 @@ class MeasurementModel(Record):
     @property
     def numbers(self) -> int:
         """Return the number of fitted coefficients."""
-        return sum(len(own) for part in self.parts for own in part.coefficients.values())
+        return sum(part.numbers for part in self.parts)
 
     def fits(self, scan: PrintedScan) -> bool:
         """Return whether the field of the scan is as large as the fields of the training scans."""

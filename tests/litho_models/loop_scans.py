@@ -35,7 +35,8 @@ def search_little(
     patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in causes])
     patch.setattr(closing, "LAWS", {one: get_effect(one) for one in laws})
     patch.setattr(closing, "TABLES", {one: get_effect(one) for one in tables})
-    patch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
+    patch.setattr(measurement_fit, "_FOR_ALL", {"background": [2]})
+    patch.setattr(measurement_fit, "_FOR_GROUPS", {})
 
 
 def blank_scan(number: int, size_px: int = 48, **facts: object) -> PrintedScan:

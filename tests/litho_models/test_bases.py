@@ -95,7 +95,8 @@ def test_no_height_of_a_held_out_scan_changes_its_prediction(
     """Check that the base, the law, the print and the shared terms do not depend on the heights of held-out
     scans.
     """
-    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
+    monkeypatch.setattr(measurement_fit, "_FOR_ALL", {"background": [2]})
+    monkeypatch.setattr(measurement_fit, "_FOR_GROUPS", {"gain": [0]})
     scans = planted([(LAW, ALL, {"": STRENGTH})], count=6)
     study = study_of(scans)
     out = np.flatnonzero(study.fold_of == 1).tolist()
