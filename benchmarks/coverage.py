@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
 RESULT = PAGE.parent / "results" / "coverage" / "coverage.json"
 FIGURE = "si_psnr_db"
 TARGETS = ("ring", "text", "letters", "spots", "chart")
+# Another printer displaces the image of each design in another way, so the errors of one design are alike.
+VERSIONS = 4
 DESIGNED_BY = "zoo:physics"
 PRINTED_BY = ("zoo:pbl", "zoo:random-features", "zoo:blur-table", "zoo:affine-mtf", "zoo:features")
 SETTINGS = {"layout.size_px": 128, "optics.distance_um": 25, "search.iterations": 60, "window.yield_draws": 2}
@@ -184,20 +187,18 @@ def measure(
     }
 
 
-def designs(folder: Path, seed: int) -> dict[str, LoadedDesign]:
-    """Return the designs by target, with searches of this seed; make those that are missing."""
-    settings = hologram_settings(changes={**SETTINGS, "search.seed": seed})
-    for target in TARGETS:
-        if not (folder / target / "design.json").exists():
-            design_hologram(
-                target,
-                DESIGNED_BY,
-                folder / target,
-                settings=settings,
-                judges=(),
-                announce=False,
-            )
-    return {target: load_design(folder / target) for target in TARGETS}
+def designs(folder: Path, seed: int) -> list[LoadedDesign]:
+    """Return ``VERSIONS`` designs of each target, from searches with different seeds. Make those that are
+    missing.
+    """
+    found = []
+    for version, target in product(range(VERSIONS), TARGETS):
+        settings = hologram_settings(changes={**SETTINGS, "search.seed": seed + version})
+        own = folder / f"{target}-{version}"
+        if not (own / "design.json").exists():
+            design_hologram(target, DESIGNED_BY, own, settings=settings, judges=(), announce=False)
+        found.append(load_design(own))
+    return found
 
 
 def line_of(rows: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
@@ -229,14 +230,13 @@ def main() -> None:
     given = parser.parse_args()
     folder = given.cache / str(given.seed)
     loaded = designs(folder, given.seed)
-    layout = next(iter(loaded.values())).record.layout
+    layout = loaded[0].record.layout
     printers = {name: load_printer(name, layout) for name in PRINTED_BY}
     rows = []
     for number in range(given.count):
         for place, kind in enumerate(KINDS):
             rng = np.random.default_rng([given.seed, number, place])
-            own = loaded[TARGETS[number % len(TARGETS)]]
-            found = partial(measure, kind, own, rng, printers, folder)
+            found = partial(measure, kind, loaded[number % len(loaded)], rng, printers, folder)
             rows.append(kept(folder / f"{kind}-{number}.json", found))
             print(number, rows[-1], flush=True)
     record = {"run": origin(), "seed": given.seed, "rows": rows}

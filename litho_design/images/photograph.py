@@ -36,11 +36,10 @@ _SMALLEST_COVERAGE = 0.9
 # Standard deviation of the relative loss of light in the corners of a photograph, which depends on the
 # objective.
 _VIGNETTING_SD = 0.1
-# Relative standard deviation of the image size between the prints that different models of the same printer
-# predict (rms over three holograms and five models). It is also the standard deviation of the tilts of these
-# images (0.013, rms over five holograms and five models). A print may scale or tilt its whole image, and the
-# scatter between the tiles of a photograph does not show it.
-_PRINT_SCALE_SD = 0.015
+# Another printer moves the whole image of a hologram, which the scatter between the tiles of a photograph
+# does not show. These are the standard deviations of the shifts, the rotation, the scale and the tilts, as
+# shares of half the window (rms over ten holograms and five models, less the scatter between tiles).
+_PRINT_MOVES_SD = np.array([0.0055, 0.0055, 0.0055, 0.015, 0.0065, 0.0065])
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
 _TILT_SD = 0.1
@@ -533,7 +532,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         free += [4, 5]
         pose, found = solved(free, smooth, fixed, pose, {4: _TILT_SD, 5: _TILT_SD})
         spread = covariance_by_tiles(found.jac, found.fun, (side, side))
-        spread += np.diag([0, 0, 0, *[(_PRINT_SCALE_SD / unit[3]) ** 2] * (len(free) - 3)])
+        spread += np.diag((_PRINT_MOVES_SD[free] * side / 2) ** 2)
         if pitch_sd:
             # The photograph shows the scale of the camera times that of the print. Both are known to be close
             # to 1, so the most probable scale of the camera is closer to 1 (linear Bayesian update).
