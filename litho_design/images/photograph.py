@@ -39,7 +39,7 @@ _VIGNETTING_SD = 0.1
 # Another printer moves the whole image of a hologram, which the scatter between the tiles of a photograph
 # does not show. These are the standard deviations of the shifts, the rotation, the scale and the tilts, as
 # shares of half the window (rms over ten holograms and five models, less the scatter between tiles).
-_PRINT_MOVES_SD = np.array([0.0055, 0.0055, 0.0055, 0.015, 0.0065, 0.0065])
+_PRINT_MOVES_SD = np.array([0.0045, 0.0045, 0.0045, 0.015, 0.005, 0.005])
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
 _TILT_SD = 0.1

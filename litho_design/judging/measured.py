@@ -38,6 +38,10 @@ _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 # A deviation counts as dust if the share of deviating pixels among all others with the same expected height
 # is smaller than this value. Heights that differ by less than ``_LIKE_HEIGHT_UM`` count as the same.
 _LARGEST_DUSTY_SHARE, _LIKE_HEIGHT_UM = 0.3, 0.005
+# Standard deviation of the shift of the whole print along one axis, by which models of the same printer
+# differ (rms over 80 prints by two of five models, less the scatter between tiles). A lag along x causes most
+# of it.
+_PRINT_SHIFT_UM = 0.0075
 # Standard deviation of the height correction for the AFM tip, as a share of this correction.
 _TIP_SD = 0.3
 # Tilt and bow are fitted to the bare substrate around the print if enough of it was measured. The substrate
@@ -69,8 +73,9 @@ class MeasuredRecord(Record):
     or together with the gain of the expected print (``print``), which also removes tilt and bow of the print
     itself. ``removed_sd_um`` contains the standard deviation of each of these terms (x, y, x², xy, y²).
     ``noise_um`` is the standard deviation of the noise, estimated from spatial frequencies at which prints
-    have no structure. ``warp_errors_um`` contains six independent errors of the registration, each as large
-    as its standard deviation (see ``_warp_errors_px``); it is empty for an aligned scan. ``scale_sd`` is the
+    have no structure. ``warp_errors_um`` contains independent errors of the registration, each as large as
+    its standard deviation: six of ``_warp_errors_px``, and shifts of the whole print along x and y, which no
+    registration can tell from its own. It is empty for an aligned scan. ``scale_sd`` is the
     relative standard deviation of the height scale. ``defect_share`` is the share of the element that shows
     dust or scars instead of the print.
     """
@@ -275,7 +280,7 @@ def _defects(off_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray) -> 
 class _Placed(NamedTuple):
     """A scan resampled on the pixels of the layout and of ``margin_px`` pixels around it. It contains the
     heights and the mask of measured pixels, both of shape (ny + 2 margin, nx + 2 margin), the orientation, a
-    warning, and the errors of the registration (see ``_warp_errors_px``).
+    warning, and the errors of the registration (see ``MeasuredRecord``).
     """
 
     height_um: np.ndarray
@@ -324,7 +329,9 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
     )  # fmt: skip
     placed = _Placed(height, valid, margin_px, quality.dihedral, quality.warning)
     topography = predicted_topography(level, quality.blur_um / pitch_um).astype(float)
-    return placed._replace(warp_errors_px=_warp_errors_px(placed.inner(height), topography))
+    errors_px = _warp_errors_px(placed.inner(height), topography)
+    shifts_px = _PRINT_SHIFT_UM / pitch_um * np.eye(2, 6)
+    return placed._replace(warp_errors_px=np.vstack([errors_px, shifts_px]))
 
 
 def _warp_errors_px(height_um: np.ndarray, topography: np.ndarray) -> np.ndarray:
@@ -445,8 +452,8 @@ def with_other_fits(
     """Yield pairs of prints of shape (ny, nx), in µm, that the processing of the scan cannot distinguish from
     the measured print. The two prints of a pair differ from the measured print in one quantity: by plus its
     standard deviation in the first, and by minus it in the second. This quantity is a term of the print's own
-    tilt and bow, a factor common to all these terms (unless they were measured on the substrate), an error of
-    the registration, or the share of ``doubt_um`` that belongs to the print instead of dust.
+    tilt and bow, a factor common to all these terms (unless they were measured on the substrate), or an error
+    of the registration. In the last pair, all or none of ``doubt_um`` belongs to the print instead of dust.
     """
     measured = height_um.double().cpu().numpy()
     removed = _shapes(measured.shape, _FITTED[record.levelling])
@@ -459,8 +466,8 @@ def with_other_fits(
             motion_px = sign * np.array(error_um) / pitch_um
             yield torch.from_numpy(_displaced(measured, motion_px)).to(height_um)
     if doubt_um.any():
-        # If none and all of it are equally likely, its standard deviation is one half.
-        yield from _pair(0.5 * doubt_um.double().cpu().numpy(), height_um)
+        # All of it and none of it are equally likely. The mean change of this pair is half of its effect.
+        yield from (height_um + doubt_um, height_um)
 
 
 def _pair(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:

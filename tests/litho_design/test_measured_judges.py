@@ -495,10 +495,10 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     record = MeasuredRecord.model_construct(levelling=levelling, removed_sd_um=removed_sd_um, **facts)
     doubt_um = torch.zeros_like(height_um)
     doubt_um[10:14, 20:24] = 0.3
-    *pairs, plus, minus = with_other_fits(height_um, record, 0.1, doubt_um)
-    # None or all of the doubtful height belongs to the print.
-    assert torch.allclose(plus - height_um, doubt_um / 2)
-    assert torch.allclose(minus - height_um, -doubt_um / 2)
+    *pairs, whole, none = with_other_fits(height_um, record, 0.1, doubt_um)
+    # All or none of the doubtful height belongs to the print.
+    assert torch.allclose(whole - height_um, doubt_um)
+    assert torch.equal(none, height_um)
     certain = with_other_fits(height_um, record, 0.1, torch.zeros_like(height_um))
     assert len(list(certain)) == len(pairs)
     changes = torch.stack([one - height_um for one in pairs])
