@@ -174,7 +174,7 @@ FAULTS = [
           "        target,\n        folder,\n        pitch",
           "tests/litho_data/test_data_cli.py -k commands_on"),
     Fault("all that scans may share is taken", "litho_models/scan_terms/measurement_fit.py",
-          "gain = left - tried[best]", "gain = left + tried[best]",
+          "gain = left - rest", "gain = left + rest",
           "tests/litho_models/test_measurement_model.py -k nothing"),
     Fault("four cells are refused as too few", "litho_data/level/plane.py",
           "slopes.shape[1] < _FEWEST_CELLS", "slopes.shape[1] <= _FEWEST_CELLS",
