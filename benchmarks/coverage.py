@@ -34,7 +34,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
 RESULT = PAGE.parent / "results" / "coverage" / "coverage.json"
 FIGURE = "si_psnr_db"
 TARGETS = ("ring", "text", "letters", "spots", "chart")
-# Another printer displaces the image of each design in another way, so the errors of one design are alike.
+# Number of designs of each target. Measurements of the same design have similar errors, so one design is not
+# enough.
 VERSIONS = 4
 DESIGNED_BY = "zoo:physics"
 PRINTED_BY = ("zoo:pbl", "zoo:random-features", "zoo:blur-table", "zoo:affine-mtf", "zoo:features")

@@ -62,3 +62,21 @@ def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
     if count == BENT_COUNT:
         zero = np.zeros(1, dtype=x.dtype)
         yield from ((x * x, zero), (y * y, zero), (zero, x * x), (zero, y * y))
+
+
+def changes(field: Array, count: int) -> Array:
+    """Return how a map changes if its points move by each flow, in pixels: the flow times the gradient of the
+    map. ``field`` has shape (ny, nx), and the result has shape (flows, ny, nx).
+    """
+    scale = normalisation(field.shape)
+    x, y = (
+        (scale[axis, axis] * np.arange(field.shape[1 - axis]) + scale[axis, 2]).astype(field.dtype)
+        for axis in (0, 1)
+    )
+    gradient_y, gradient_x = np.gradient(field)
+    return np.stack(
+        [
+            along_x * gradient_x + along_y * gradient_y
+            for along_x, along_y in flows(count, x[None, :], y[:, None])
+        ]
+    )

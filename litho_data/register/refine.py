@@ -15,7 +15,7 @@ import numpy as np
 
 from litho_data.foundation import Array, Shape
 from litho_data.register.bend import Bend
-from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flows, normalisation
+from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, changes, flows, normalisation
 from litho_data.register.geometry import apply_transform, corners, warped_grid
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
@@ -218,14 +218,7 @@ def _regressors(topography: Array, count: int) -> Array:
     each of the ``count`` generators of the warp.
     """
     shape = topography.shape
-    scale = normalisation(shape)[0, 0]
-    gradient_y, gradient_x = np.gradient(topography.astype(np.float32))
-    y = ((np.arange(shape[0]) - (shape[0] - 1) / 2) * scale).astype(np.float32)[:, None]
-    x = ((np.arange(shape[1]) - (shape[1] - 1) / 2) * scale).astype(np.float32)[None, :]
-    change = [
-        (along_x * gradient_x + along_y * gradient_y) / np.float32(scale)
-        for along_x, along_y in flows(count, x, y)
-    ]
+    change = changes(topography.astype(np.float32), count) / np.float32(normalisation(shape)[0, 0])
     centred = topography.astype(np.float32) - topography.mean()
     return np.stack([centred, *quadratic_basis(shape).astype(np.float32), *change])
 

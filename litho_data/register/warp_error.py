@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from litho_data.foundation import Array, Shape
-from litho_data.register.flows import BENT_COUNT, LADDER, flows, normalisation
+from litho_data.register.flows import BENT_COUNT, LADDER, changes, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram
 from litho_data.register.topography import predicted_topography, quadratic_basis, smooth_measured
@@ -73,20 +73,10 @@ class WarpError:
 
         ``height`` and the result have shape (ny, nx).
         """
-        shape = height.shape
-        normalise = normalisation(shape)
-        gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
-        x = normalise[0, 0] * np.arange(shape[1])[None, :] + normalise[0, 2]
-        y = normalise[1, 1] * np.arange(shape[0])[:, None] + normalise[1, 2]
-        moved = np.stack(
-            [
-                (along_x * gradient_x + along_y * gradient_y).ravel()
-                for along_x, along_y in flows(len(self.covariance), x, y)
-            ]
-        )
+        moved = changes(height.astype(float), len(self.covariance)) / normalisation(height.shape)[0, 0]
         sizes, directions = np.linalg.eigh(self.covariance)
-        total: Array = np.maximum(sizes, 0.0) @ (directions.T @ moved) ** 2
-        return total.reshape(shape)
+        total: Array = np.maximum(sizes, 0.0) @ (directions.T @ moved.reshape(len(moved), -1)) ** 2
+        return total.reshape(height.shape)
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:

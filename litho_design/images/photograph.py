@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -229,8 +229,8 @@ def photographed_image(
     neighbours. Then a model of the camera is fitted by least squares, so that the photograph matches the
     expected image. The parameters of the camera are position, rotation, tilt, gain and background. The scale
     is fitted only if the pitch has an uncertainty, because a fitted scale would conceal that a print makes
-    its image too large. All eight orientations are tried. A photograph that fits another
-    orientation better than ``orientation`` is rejected.
+    its image too large. All eight orientations are tried. A photograph that fits another orientation better
+    than ``orientation`` is rejected.
 
     Args:
         wanted: expected image in any unit, shape (m, m).
@@ -527,30 +527,34 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         if more:
             images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
         pose, _ = solved(free, *images, pose, {3: pitch_sd} if pitch_sd else {})
-    spread, scale_sd = np.zeros((0, 0)), 0.0
-    if further:
-        free += [4, 5]
-        pose, found = solved(free, smooth, fixed, pose, {4: _TILT_SD, 5: _TILT_SD})
-        spread = covariance_by_tiles(found.jac, found.fun, (side, side))
-        spread += np.diag((_PRINT_MOVES_SD[free] * side / 2) ** 2)
-        if pitch_sd:
-            # The photograph shows the scale of the camera times that of the print. Both are known to be close
-            # to 1, so the most probable scale of the camera is closer to 1 (linear Bayesian update).
-            share = spread[:, 3] / (spread[3, 3] + (pitch_sd / unit[3]) ** 2)
-            pose[free] -= share * pose[3] / unit[3] * unit[free]
-            spread -= np.outer(share, spread[3])
-            scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
-    warp = _camera(pose, photo.shape, side, scale)
-    correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
-    if not further or not correlation > 0:
-        return _Fit(warp, correlation)
+
+    def placed() -> _Fit:
+        correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
+        return _Fit(_camera(pose, photo.shape, side, scale), correlation)
+
+    if not further:
+        return placed()
+    free += [4, 5]
+    pose, found = solved(free, smooth, fixed, pose, {4: _TILT_SD, 5: _TILT_SD})
+    spread = covariance_by_tiles(found.jac, found.fun, (side, side))
+    spread += np.diag((_PRINT_MOVES_SD[free] * side / 2) ** 2)
+    scale_sd = 0.0
+    if pitch_sd:
+        # The photograph shows the scale of the camera times that of the print. Both are known to be close to
+        # 1, so the most probable scale of the camera is closer to 1 (linear Bayesian update).
+        share = spread[:, 3] / (spread[3, 3] + (pitch_sd / unit[3]) ** 2)
+        pose[free] -= share * pose[3] / unit[3] * unit[free]
+        spread -= np.outer(share, spread[3])
+        scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
+    fit = placed()
+    if not fit.correlation > 0:
+        return fit
     # One pair of maps for each independent movement of the camera.
     variance, ways = np.linalg.eigh(spread)
     steps = np.zeros((len(free), len(pose)))
     steps[:, free] = (ways * np.sqrt(variance.clip(0))).T * unit[free]
-    return _Fit(
-        warp,
-        correlation,
+    return replace(
+        fit,
         other_warps=[
             [_camera(at, photo.shape, side, scale) for at in (pose + one, pose - one)] for one in steps
         ],
@@ -560,7 +564,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     )
 
 
-def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, float]:
+def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, Any]:
     """Fit the counts by least squares as background + gain * (blurred expected light)^gamma."""
     import cv2
 

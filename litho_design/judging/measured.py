@@ -16,7 +16,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
-from litho_data.register.flows import GENERATORS, LADDER, flows, normalisation
+from litho_data.register.flows import GENERATORS, LADDER, changes, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import interior_of
 from litho_data.register.topography import predicted_topography, smooth_measured
@@ -74,10 +74,10 @@ class MeasuredRecord(Record):
     itself. ``removed_sd_um`` contains the standard deviation of each of these terms (x, y, x², xy, y²).
     ``noise_um`` is the standard deviation of the noise, estimated from spatial frequencies at which prints
     have no structure. ``warp_errors_um`` contains independent errors of the registration, each as large as
-    its standard deviation: six of ``_warp_errors_px``, and shifts of the whole print along x and y, which no
-    registration can tell from its own. It is empty for an aligned scan. ``scale_sd`` is the
-    relative standard deviation of the height scale. ``defect_share`` is the share of the element that shows
-    dust or scars instead of the print.
+    its standard deviation: the six of ``_warp_errors_px``, and two shifts of the whole print, along x and
+    along y, because a registration cannot tell whether the print or the scan is shifted. It is empty for an
+    aligned scan. ``scale_sd`` is the relative standard deviation of the height scale. ``defect_share`` is the
+    share of the element that shows dust or scars instead of the print.
     """
 
     name: str
@@ -351,11 +351,7 @@ def _warp_errors_px(height_um: np.ndarray, topography: np.ndarray) -> np.ndarray
     height = smooth_measured(height_um, SCAN_BLUR_PX)
     still = np.dstack([_shapes(shape, (0, 1, 2)), topography])
     found, *_ = np.linalg.lstsq(still[used], height[used], rcond=None)
-    slope_y, slope_x = np.gradient(found[-1] * topography)
-    scale = normalisation(shape)
-    x, y = (scale[axis, axis] * np.arange(shape[1 - axis]) + scale[axis, 2] for axis in (0, 1))
-    motions = flows(LADDER["affine"], x[None], y[:, None])
-    moved = np.stack([along_x * slope_x + along_y * slope_y for along_x, along_y in motions], axis=-1)
+    moved = np.moveaxis(changes(found[-1] * topography, LADDER["affine"]), 0, -1)
     slopes = np.where(used[..., None], np.dstack([still, moved]), 0.0)
     residual = np.where(used, height - still @ found, 0.0)
     covariance = covariance_by_tiles(slopes.reshape(-1, slopes.shape[-1]), residual.ravel(), shape)
@@ -466,7 +462,8 @@ def with_other_fits(
             motion_px = sign * np.array(error_um) / pitch_um
             yield torch.from_numpy(_displaced(measured, motion_px)).to(height_um)
     if doubt_um.any():
-        # All of it and none of it are equally likely. The mean change of this pair is half of its effect.
+        # The deviation may be dust or print with equal probability, so the score is corrected by half of its
+        # effect.
         yield from (height_um + doubt_um, height_um)
 
 

@@ -32,8 +32,8 @@ _KEPT_BYTES = 512 * 2**20
 # Indices of the features whose strength may depend on the writing order or the dose: the height, |∂y| and
 # |∂x| of the layout blurred with σ = 0.3 µm, and the layout blurred with σ = 1.6 µm (the surroundings).
 _VARYING = (18, 21, 22, 7)
-# Strengths of the regularisation from which the ridge regression chooses one. Each is the weight of the prior
-# that no feature matters, stated as a number of scans.
+# The ridge regression chooses one of these strengths of its regularisation. A strength of w pulls the weights
+# of the features to zero as strongly as w scans would.
 _SHRINKINGS = (100.0, 10.0, 1.0, 1e-1, 1e-2, 1e-3)
 
 

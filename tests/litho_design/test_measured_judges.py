@@ -444,7 +444,7 @@ def test_the_angle_of_few_spots_is_as_uncertain_as_fits_scatter():
 
 
 def test_each_parameter_of_the_registration_is_as_uncertain_as_fits_scatter():
-    """Check the errors of registering bars along y with few notches, in rough scans.
+    """Check rough scans of bars along y, which have only a few notches.
 
     The bars determine the shift along x much better than that along y. The scatter is that of fits of the
     same six parameters, gain and background to 60 scans, so each standard deviation is known to 9 %.

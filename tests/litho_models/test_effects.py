@@ -364,7 +364,9 @@ def test_the_gradient_of_a_dilation_is_that_of_the_piece_on_which_the_tip_stands
 
 
 def test_a_tip_dilates_a_mirrored_surface_to_the_mirror_image() -> None:
-    """Check a tip that touches only points within half a pixel, at the edges of the field as well."""
+    """Check the whole field, including its edges. The tip is so sharp that it touches only points within half
+    a pixel.
+    """
     draw = torch.Generator().manual_seed(6)
     surface = 0.2 * torch.rand(1, 1, 9, 12, generator=draw, dtype=torch.float64)
     dilated, mirrored = (
