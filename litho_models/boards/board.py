@@ -84,7 +84,7 @@ def new_board(
             hidden, store = begun.folder / HIDDEN / name_of(draw), store_of(begun.folder, draw)
             if not (hidden / Hidden.FILE_NAME).exists():
                 jobs = trial_jobs(draw, n_scans, size_px)
-                planted = plant(draw, jobs)
+                planted = plant(draw, jobs, draws.base)
                 store.parent.mkdir(exist_ok=True)
                 with tempfile.TemporaryDirectory() as place:
                     made = Path(place) / store.name

@@ -210,10 +210,6 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # If the base model fits the width of the spot, its value ``spot_um`` is the standard deviation of the
-    # squared spot.
-    true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
-
     def error(values: dict[str, float]) -> float:
         return float(np.median([abs(values[name] / own - 1) for name, own in true.items() if name in values]))
 

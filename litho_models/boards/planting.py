@@ -1,9 +1,9 @@
 """Find the strengths of the causes of a trial, and simulate its prints and scans with these causes.
 
-The size of a cause is the rms residual after the base model has been refitted to prints with this cause. To
-measure this size, the Physics model is fitted to noise-free scans that contain the cause. (Without causes,
-the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine registration error
-are fitted to each scan at the same time.
+The size of a cause is the rms residual after the best base model has been refitted to prints with this cause.
+To measure this size, each base model that the loop may choose is fitted to noise-free scans that contain the
+cause. (Without causes, the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an
+affine registration error are fitted to each scan at the same time.
 """
 
 from __future__ import annotations
@@ -25,15 +25,18 @@ from litho_models.boards.draws import names_of
 from litho_models.boards.other_forms import FORMS, FormCause
 from litho_models.boards.records import CauseDraw, Draw, Planted
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
-from litho_models.fitting.small_models import ModelProblem
+from litho_models.fitting.small_models import ModelProblem, fitted_numbers
+from litho_models.loop.bases import built
 from litho_models.models import build_model
 from litho_models.scan_terms import POLICIES
 from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# The search for a strength uses four scans, which are spread over the printing order and over the two cut-off
-# frequencies with which layouts are drawn. The size of the cause is then measured on all scans.
+# The search for a strength uses four scans. They are spread over the printing order and over the two cut-off
+# frequencies with which layouts are drawn. If the cause is weaker in some scans, both strong and weak scans
+# are used. To save time, only the Physics model is fitted. The size of the cause is then measured on all
+# scans, with all base models.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
@@ -90,9 +93,10 @@ def fab_of(
     )
 
 
-def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strength at which each drawn cause has its drawn size. The size is measured in the given
-    fields, in which only this cause is planted.
+def plant(draw: Draw, jobs: Sequence[Job], base: str) -> list[Planted]:
+    """Find the strength at which each drawn cause has its drawn size for the Physics model. Then measure its
+    size for the base model that fits best. The sizes are measured in the given fields, in which only this
+    cause is planted. ``base`` is the name of the loop's base model, or ``auto`` for several.
 
     If the draw has a form that changes the printer (``base``), this form comes first in the result.
 
@@ -101,7 +105,7 @@ def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
     size is the rms change of the scans before the refit, because the refit absorbs most of this change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
-    return [_sized(one, jobs, draw) for one in drawn]
+    return [_sized(one, jobs, draw, base) for one in drawn]
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
@@ -142,16 +146,25 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
     return found
 
 
-def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer) -> float:
-    """Fit the Physics model and the per-scan terms to noise-free scans, and return the rms residual, nm.
+def refitted_rms_nm(
+    heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer, base: str = ""
+) -> float:
+    """Fit models and the per-scan terms to noise-free scans. Return the rms residual of the model that fits
+    best, nm.
 
     Args:
         heights_um: one array of shape (ny, nx) per job: heights on the grid of the layout, µm.
-        printer: printer whose parameters are used as starting values of the fit.
+        printer: printer whose parameters are used as starting values of the Physics model.
+        base: name of a further model, or ``auto`` for several. If it is empty, only the Physics model is
+            fitted.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
-    model = plain_model(printer)
-    start = np.concatenate([p.detach().numpy().ravel() for p in model.parameters()])
+    further = built(base, scans[0]).values() if base else ()
+    return min(_rms_nm(model, scans) for model in (plain_model(printer), *further))
+
+
+def _rms_nm(model: Simulator, scans: Sequence[PrintedScan]) -> float:
+    start = fitted_numbers(model).astype(np.float64)
     fitted = fit_least_squares(_Refit(model, scans, _SCAN_TERMS), start, _RULES)
     left = [
         float(gram(part.residual[:, None], part.basis.T)[0, 0]) / len(part.residual) for part in fitted.linear
@@ -169,7 +182,9 @@ class _Refit(ModelProblem):
 
 
 def plain_model(printer: Printer) -> Simulator:
-    """Return the Physics model with the values that reproduce the virtual fab without causes."""
+    """Return the Physics model with the values that reproduce the virtual fab without causes. As in the loop,
+    the width of its spot is one of the fitted parameters.
+    """
     return build_model(
         "physics",
         pitch_um=printer.pitch_um,
@@ -182,6 +197,7 @@ def plain_model(printer: Printer) -> Simulator:
         kappa_min_init=printer.loose_retention,
         sigma_diffusion_init_um=printer.network_reach_um,
         bias_init_um=printer.base_um,
+        spot="round",
     )
 
 
@@ -200,13 +216,14 @@ def _as_scan(job: Job, height_um: np.ndarray, printer: Printer) -> PrintedScan:
     )
 
 
-def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
+def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw, base: str) -> Planted:
     wanted, limit, printer = drawn.wanted_rms_nm, _limit(drawn.name), printer_of(draw)
-    few = [jobs[i] for i in np.linspace(0, len(jobs) - 1, min(_SOUGHT_ON, len(jobs))).round().astype(int)]
+    by_share = sorted(jobs, key=lambda job: share_of(drawn, job))
+    few = [by_share[i] for i in np.linspace(0, len(jobs) - 1, min(_SOUGHT_ON, len(jobs))).round().astype(int)]
 
-    def left_nm(strength: float, fields: Sequence[Job] = few) -> float:
+    def left_nm(strength: float, fields: Sequence[Job] = few, base: str = "") -> float:
         heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], fields)
-        return refitted_rms_nm(heights, fields, printer)
+        return refitted_rms_nm(heights, fields, printer, base)
 
     def change_nm(strength: float) -> float:
         return knob_rms_nm(KnobSetting(drawn.name, strength, draw.seed), jobs, printer=printer)
@@ -217,7 +234,7 @@ def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
         strength, _ = search_strength(
             measured, wanted, highest=limit, at_highest=at_limit, precision=precision
         )
-    return _planted(drawn, strength, left_nm(strength, jobs))
+    return _planted(drawn, strength, left_nm(strength, jobs, base))
 
 
 def _limit(name: str) -> float:

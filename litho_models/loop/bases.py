@@ -68,11 +68,9 @@ def bases_for(
             base that is not refitted.
     """
     scan = study.stored[0]
-    bases: dict[str, nn.Module]
-    if base == AUTO:
-        bases = {name: _built(name, scan) for name in _COMPETING}
-    elif base in MODELS:
-        bases = {base: _built(base, scan, fields)}
+    bases: Mapping[str, nn.Module]
+    if base == AUTO or base in MODELS:
+        bases = built(base, scan, fields)
     else:
         bases = _frozen(base, scan.pitch_um, store)
     small = all(map(is_small, bases.values()))
@@ -92,8 +90,14 @@ def bases_for(
     return {base: train_folds(study, partial(fit_in_cache, base, config=recipe, cache=cache))}
 
 
-def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simulator:
-    return build_model(name, **common_geometry([scan]), **{**_USUAL.get(name, {}), **fields})
+def built(base: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> dict[str, Simulator]:
+    """Return the untrained model with the given name, or the models that compete if the name is ``auto``.
+    The result is keyed by name. ``scan`` provides the pitch and the levels, and ``fields`` the settings.
+    """
+    return {
+        name: build_model(name, **common_geometry([scan]), **{**_USUAL.get(name, {}), **fields})
+        for name in (_COMPETING if base == AUTO else (base,))
+    }
 
 
 def _frozen(base: str, pitch_um: float, store: Store | None) -> dict[str, nn.Module]:
