@@ -45,7 +45,7 @@ def bases_for(
     fields: Mapping[str, Any] = {},
     nested: bool = False,
     store: Store | None = None,
-) -> dict[str, nn.Module]:
+) -> Mapping[str, nn.Module]:
     """Return the base models that the loop may correct, keyed by name. If the base is a network, it is
     trained once for each fold, without the scans of this fold.
 
