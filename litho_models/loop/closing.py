@@ -44,7 +44,7 @@ class Closed:
 
     Attributes:
         base_name: name of the chosen base model.
-        rivals: results of the search for causes with each of the other base models, keyed by model name.
+        rivals: the other base models, fitted to the corrected scans, keyed by model name.
         plain: the chosen base model, fitted to the original scans.
         base: the chosen base model, fitted to the corrected scans (see ``study``).
         named: result of the search for causes, after all checks.
@@ -58,7 +58,7 @@ class Closed:
     """
 
     base_name: str
-    rivals: Mapping[str, Found]
+    rivals: Mapping[str, State]
     plain: State
     base: State
     named: Found
@@ -110,13 +110,13 @@ class Closed:
         return [*self.named.causes, *self.lawful.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Return whether the search with every other base model has also found the cause.
+        """Return whether every other base model also needs the cause.
 
         Base models with more parameters than the chosen base model are ignored, because their parameters may
         have absorbed the cause.
         """
         most = self.plain.twin.own
-        return all(rival.has(cause) for rival in self.rivals.values() if rival.state.twin.own <= most)
+        return all(name in cause.survives_on for name, one in self.rivals.items() if one.twin.own <= most)
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
@@ -151,12 +151,14 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         first = next(iter(searches.values()), Found(state))
         searches[name] = search(first.with_base(state), candidates)
     chosen = _simplest(searches)
-    start, named = starts[chosen], searches.pop(chosen)
+    start, named = starts.pop(chosen), searches[chosen]
     rest = _rest_beside(start)
     lawful, described = _checked(start, named, rest)
+    for name, rival in starts.items():
+        named.causes = _tested_on(name, rival, lawful.state, named.causes)
     return Closed(
         base_name=chosen,
-        rivals=searches,
+        rivals=starts,
         plain=plain[chosen],
         base=start,
         named=named,
@@ -256,6 +258,27 @@ def _simplest(searches: Mapping[str, Found]) -> str:
         if found.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
     }
     return min(close, key=close.__getitem__)
+
+
+def _tested_on(name: str, rival: State, final: State, causes: list[Cause]) -> list[Cause]:
+    """Fit another base model together with all effects that were found. Add its name to each cause whose gain
+    held-out scans still confirm in this model.
+
+    Args:
+        name, rival: the other base model, fitted without effects.
+        final: the chosen base model with all causes and laws.
+        causes: the causes.
+    """
+    if not causes:
+        return causes
+    study = rival.study
+    study.report(f"testing the causes with {name}")
+    state = fit_state(replace(rival.twin, effects=final.twin.effects), study)
+    needed = (not judge_states(state.without(one.name), state).reason(one.by) for one in causes)
+    return [
+        replace(one, survives_on=(*one.survives_on, name)) if kept else one
+        for one, kept in zip(causes, needed, strict=True)
+    ]
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:

@@ -131,8 +131,7 @@ class FoundEffect(Record):
             does not differ by group.
         left_out_nm: increase of the headline error (see ``ErrorRow.is_headline``) if the effect is removed
             from the model.
-        survives_on: names of the other base models with which the search also found the effect, or an effect
-            that looks the same.
+        survives_on: names of the other base models that also need the effect beside all other effects.
     """
 
     name: str

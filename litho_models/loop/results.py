@@ -114,8 +114,7 @@ def _found(
     effect, judgement, names = get_effect(cause.name), cause.judgement, [cause.name, *cause.alike]
     role, *others = {get_effect(name).role for name in names}
     knowledge = effect.knowledge
-    # If the search with another base does not find a cause, the cause may only correct an error of the chosen
-    # base.
+    # If another base does not need a cause, the cause may only correct an error of the chosen base.
     if knowledge == "cause" and cause.role is None and not closed.needed_by_all(cause):
         knowledge = "description"
     verdicts: dict[Knowledge, EffectVerdict] = {
@@ -140,7 +139,7 @@ def _found(
         family_p=cause.family_p,
         group_p=cause.group_p,
         left_out_nm=left_out_nm,
-        survives_on=[name for name, rival in closed.rivals.items() if rival.has(cause)],
+        survives_on=[*cause.survives_on],
     )
 
 

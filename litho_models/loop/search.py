@@ -44,6 +44,7 @@ class Cause:
         values: for a table, the starting values of its parameters, keyed by group label.
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
         corrects: whether the effect was rejected because it may merely correct the formula of another effect.
+        survives_on: names of the other base models that also need this effect beside all others.
         excluded: effects that look the same in these scans but were excluded by later prints.
         role: role of the effect (``process`` or ``measurement``, for example), if later prints decided it;
             otherwise None.
@@ -58,6 +59,7 @@ class Cause:
     values: Values = field(default_factory=dict)
     reason: str = ""
     corrects: bool = False
+    survives_on: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
     role: Role | None = None
 

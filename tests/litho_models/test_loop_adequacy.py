@@ -14,9 +14,18 @@ from litho_models.loop.checking import FORM_SHARE, Check, reshaped_gain
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.judging import judge
+from litho_models.loop.model import Twin
 from litho_models.loop.search import Cause, Found
+from litho_models.models import build_model
 from litho_models.scan_terms.grouped import ALL
-from tests.litho_models.loop_scans import bare_state, planted, study_of
+from tests.litho_models.loop_scans import (
+    LEVEL_HEIGHT_UM,
+    LEVELS,
+    PITCH_UM,
+    bare_state,
+    planted,
+    study_of,
+)
 
 
 def values_of(name: str) -> dict[str, float]:
@@ -179,17 +188,25 @@ def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
     """Check that the cause may be missing on another base only if that base has more numbers than the chosen
     base.
     """
-    cause = gaining("dose-exponent", 10)
-    rivals = {
-        name: Found(with_base(own), [replace(cause, name="hatch-ripple", alike=("dose-exponent",))])
-        if name in found_on
-        else Found(with_base(own), [gaining("slope-thinning", 10)])
-        for name, own in {"affine-mtf": 7, "blur-table": 14}.items()
-    }
+    cause = replace(gaining("dose-exponent", 10), survives_on=tuple(found_on))
+    rivals = {name: with_base(own) for name, own in {"affine-mtf": 7, "blur-table": 14}.items()}
     others = dict.fromkeys(("base", "named", "lawful", "described", "rest", "untestable"))
     closed = Closed(base_name="physics", rivals=rivals, plain=with_base(7), **others)
     found = results._found(closed, cause, {}, 0.1)
     assert (found.knowledge, found.survives_on) == (knowledge, found_on)
+
+
+def test_a_cause_survives_on_the_bases_that_need_it_beside_everything_found() -> None:
+    """Check a blur that one base cannot make and another base contains."""
+    blur = {"": {"variance_um2": 0.16}}
+    study = study_of(planted([("diffusion-blur", ALL, blur)]))
+    final = fit_state(bare_state(study).twin.with_effect("diffusion-blur", ALL, blur), study)
+    causes = [gaining("diffusion-blur", 10)]
+    facts = {"pitch_um": PITCH_UM, "level_height_um": LEVEL_HEIGHT_UM, "levels": LEVELS}
+    for name, sigmas_um in (("sharp", (0.25,)), ("soft", (0.25, 0.4, 0.5))):
+        base = build_model("affine-mtf", sigmas_um=sigmas_um, **facts)
+        causes = closing._tested_on(name, fit_state(Twin.bare(base), study), final, causes)
+    assert [one.survives_on for one in causes] == [("sharp",)]
 
 
 @pytest.mark.parametrize(
