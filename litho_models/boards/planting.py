@@ -24,9 +24,9 @@ from litho_data.virtual_fab.strength import knob_rms_nm, search_strength
 from litho_models.boards.draws import names_of
 from litho_models.boards.other_forms import FORMS, FormCause
 from litho_models.boards.records import CauseDraw, Draw, Planted
+from litho_models.fitting.base_models import base_models
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
 from litho_models.fitting.small_models import ModelProblem, fitted_numbers
-from litho_models.loop.bases import built
 from litho_models.models import build_model
 from litho_models.scan_terms import POLICIES
 from litho_models.simulator import Simulator
@@ -159,7 +159,7 @@ def refitted_rms_nm(
             fitted.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
-    further = built(base, scans[0]).values() if base else ()
+    further = base_models(base, scans[0]).values() if base else ()
     return min(_rms_nm(model, scans) for model in (plain_model(printer), *further))
 
 

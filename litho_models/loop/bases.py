@@ -17,7 +17,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan, Store
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
-from litho_models.fitting.fit import common_geometry
+from litho_models.fitting.base_models import AUTO, base_models
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
@@ -25,15 +25,8 @@ from litho_models.frozen.on_store import trained_ids
 from litho_models.loop.fits import Study
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.prepared import exposed
-from litho_models.models import MODELS, build_model
-from litho_models.simulator import Simulator, is_small
-
-AUTO = "auto"
-# Base models from which the loop chooses one by default. The first of them has the same form as the Physics
-# model of the paper.
-_COMPETING = ("physics", "affine-mtf", "blur-table")
-# Settings of base models that differ from the defaults of these models.
-_USUAL = {"physics": {"spot": "round"}}
+from litho_models.models import MODELS
+from litho_models.simulator import is_small
 
 
 def bases_for(
@@ -70,7 +63,7 @@ def bases_for(
     scan = study.stored[0]
     bases: Mapping[str, nn.Module]
     if base == AUTO or base in MODELS:
-        bases = built(base, scan, fields)
+        bases = base_models(base, scan, fields)
     else:
         bases = _frozen(base, scan.pitch_um, store)
     small = all(map(is_small, bases.values()))
@@ -88,16 +81,6 @@ def bases_for(
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     recipe = TrainingConfig.of_recipe("fast", base, film=study.of_films, seed=study.seed, **given)
     return {base: train_folds(study, partial(fit_in_cache, base, config=recipe, cache=cache))}
-
-
-def built(base: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> dict[str, Simulator]:
-    """Return the untrained model with the given name, or the models that compete if the name is ``auto``.
-    The result is keyed by name. ``scan`` provides the pitch and the levels, and ``fields`` the settings.
-    """
-    return {
-        name: build_model(name, **common_geometry([scan]), **{**_USUAL.get(name, {}), **fields})
-        for name in (_COMPETING if base == AUTO else (base,))
-    }
 
 
 def _frozen(base: str, pitch_um: float, store: Store | None) -> dict[str, nn.Module]:

@@ -17,11 +17,12 @@ from litho_data.foundation.run_facts import run_info
 from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
+from litho_models.fitting.base_models import AUTO
 from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.card import OUT_OF_FOLD
 from litho_models.frozen.files import MODEL_FILES, save_frozen
-from litho_models.loop.bases import AUTO, bases_for
+from litho_models.loop.bases import bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, error_rows, nested_errors
 from litho_models.loop.fits import Study

@@ -19,6 +19,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import locked_ids
 from litho_models.effects import get_effect
+from litho_models.fitting import base_models
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_frozen
@@ -394,8 +395,8 @@ def test_a_base_is_chosen_by_name_or_as_the_smallest_good_one(
 
     assert chosen("affine") == ("affine", [])
     # Every scan may have its own gain and datum, so identity does as well as affine.
-    monkeypatch.setattr(bases, "_COMPETING", ("affine", "identity"))
-    assert chosen(bases.AUTO) == ("identity", ["affine"])
+    monkeypatch.setattr(base_models, "_COMPETING", ("affine", "identity"))
+    assert chosen(base_models.AUTO) == ("identity", ["affine"])
     with pytest.raises(InputError):
         chosen("nonsense")
 

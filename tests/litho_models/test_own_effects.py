@@ -39,7 +39,7 @@ def test_the_example_finds_the_effects_that_it_registers(
         scans.append(replace(scan, height_um=(scan.height_um + added).astype(np.float32)))
     store, out = write_store(tmp_path / "s.zarr", scans), tmp_path / "loop"
     search_little(monkeypatch, ["vignetting", "sinking-layers"])
-    monkeypatch.setattr("litho_models.loop.bases.build_model", lambda *_, **__: base_model())
+    monkeypatch.setattr("litho_models.fitting.base_models.build_model", lambda *_, **__: base_model())
     monkeypatch.setattr("sys.argv", ["own_effect.py", str(store), "--out", str(out)])
     own_effect.main()
     said = capsys.readouterr().out
