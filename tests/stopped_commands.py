@@ -43,11 +43,12 @@ from litho_models.boards.records import Answer
 from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.evaluate import evaluate
+from litho_models.fitting import base_models
 from litho_models.fitting.runs import train
 from litho_models.frozen.exporting import export_model
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze as freeze_model
-from litho_models.loop import bases, closing
+from litho_models.loop import closing
 from litho_models.loop import run as loop_run
 from litho_models.monitoring import check
 from litho_models.noise.analyse import analyse_noise
@@ -178,7 +179,7 @@ def _planted(folder: Path) -> None:
     strength = {"": get_effect("write-order-memory").with_values({"strength": 0.3})}
     write_store(folder / "prints.zarr", planted([("write-order-memory", ALL, strength)], count=5))
     search_little(_PATCH, ["write-order-memory", "slope-thinning"])
-    _PATCH.setattr(bases, "build_model", lambda *name, **facts: base_model())
+    _PATCH.setattr(base_models, "build_model", lambda *name, **facts: base_model())
     _PATCH.setattr(loop_run, "close", _once(closing.close))
 
 

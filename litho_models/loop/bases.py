@@ -63,7 +63,7 @@ def bases_for(
     scan = study.stored[0]
     bases: Mapping[str, nn.Module]
     if base == AUTO or base in MODELS:
-        bases = base_models(base, scan, fields)
+        bases = base_models(base, scan, {} if base == AUTO else fields)
     else:
         bases = _frozen(base, scan.pitch_um, store)
     small = all(map(is_small, bases.values()))

@@ -1,7 +1,7 @@
 """Close the loop on a set of scans: find causes and laws in the residual of a base model.
 
-The search for causes is run once with each base model. The base models are then compared, each together with
-the causes that were found with it.
+The search is run with one base model after the other, until a model leaves nothing that can be explained. The
+base models are then compared, each together with the causes and laws that were found with it.
 
 ``close`` is an estimator: it uses only the given scans for all choices and fits, and its result can predict
 any other scan. To judge its choices on held-out scans, call ``close`` without these scans.
@@ -143,17 +143,20 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
     if told := estimate("the loop", _OVER_FIRST_FITS * (time.monotonic() - began_s)):
         study.report(told + ("; if it finds effects, several times as long" if freed.of_films else ""))
-    searches: dict[str, Found] = {}
+    rest = _rest_beside(next(iter(starts.values())))
+    ends: dict[str, tuple[Found, Found, Found]] = {}
     for name, state in starts.items():
         study.report(f"searching for effects that {name} lacks")
-        # The other bases probably lack the same causes as the first base, so their searches start from the
-        # causes that were found with the first base.
-        first = next(iter(searches.values()), Found(state))
-        searches[name] = search(first.with_base(state), candidates)
-    chosen = _simplest(searches)
-    start, named = starts.pop(chosen), searches[chosen]
-    rest = _rest_beside(start)
-    lawful, described = _checked(start, named, rest)
+        # All base models probably lack the same causes, so each search starts from the causes that were found
+        # with the first base model.
+        first, *_ = next(iter(ends.values()), [Found(state)])
+        named = search(first.with_base(state), candidates)
+        lawful, described = _checked(state, named, rest)
+        ends[name] = named, lawful, described
+        if not rest(lawful.state).matters:
+            break
+    chosen = _simplest(ends)
+    start, (named, lawful, described) = starts.pop(chosen), ends[chosen]
     for name, rival in starts.items():
         named.causes = _tested_on(name, rival, lawful.state, named.causes)
     return Closed(
@@ -240,22 +243,25 @@ def freed_scans(state: State) -> list[PreparedScan]:
     return freed
 
 
-def _simplest(searches: Mapping[str, Found]) -> str:
+def _simplest(ends: Mapping[str, tuple[Found, Found, Found]]) -> str:
     """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
     them is chosen.
 
     For each base model, count the causes that the search found with this base model but missed with at least
     one other. The model with the fewest such causes is the simplest. If several models have the same number
     of such causes, choose the model that has the fewest parameters together with its effects.
+
+    Args:
+        ends: for each base model, the results of the searches for causes, laws and tables.
     """
-    best_nm2 = min(found.state.mse_nm2 for found in searches.values())
+    best_nm2 = min(lawful.state.mse_nm2 for _, lawful, _ in ends.values())
     close = {
         name: (
-            sum(not all(other.has(cause) for other in searches.values()) for cause in found.causes),
-            len(found.state.twin.vector),
+            sum(not all(other.has(cause) for other, *_ in ends.values()) for cause in named.causes),
+            len(lawful.state.twin.vector),
         )
-        for name, found in searches.items()
-        if found.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
+        for name, (named, lawful, _) in ends.items()
+        if lawful.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
     }
     return min(close, key=close.__getitem__)
 

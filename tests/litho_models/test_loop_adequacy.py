@@ -229,7 +229,7 @@ def test_of_equally_good_bases_the_one_whose_causes_others_share_is_chosen(
         "blur-table": Found(with_base(14, 1, better_nm2), [shared]),
         "physics": Found(with_base(7, 5), [shared]),
     }
-    assert closing._simplest(found) == chosen
+    assert closing._simplest({name: (own, own, own) for name, own in found.items()}) == chosen
 
 
 @pytest.mark.parametrize(

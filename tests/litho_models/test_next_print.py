@@ -33,10 +33,11 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain, Frame
 from litho_models.effects.registry import TIP
+from litho_models.fitting import base_models
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import save_frozen
-from litho_models.loop import bases, prepared
+from litho_models.loop import prepared
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES, State, TwinProblem, fit_state
 from litho_models.loop.judging import judge_states
@@ -597,7 +598,7 @@ def test_two_stores_become_a_result_a_model_and_a_plan(
     one_cause: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Check two rounds of a loop. The strength of the effect is known to differ between groups of scans."""
-    monkeypatch.setattr(bases, "build_model", lambda *name, **facts: base_model())
+    monkeypatch.setattr(base_models, "build_model", lambda *name, **facts: base_model())
     first = write_store(tmp_path / "first.zarr", by_order())
     new = second_round(5, SLOPE, "microscope")
     second = write_store(tmp_path / "second.zarr", [*new, unmeasured(new[0])])
