@@ -188,7 +188,7 @@ def _once(close: Callable[..., Any]) -> Callable[..., Any]:
     kept: dict[tuple[str, ...], Any] = {}
 
     def found(study: Any, models: Any) -> Any:
-        scans = tuple(scan.stored.id for scan in study.scans)
+        scans = tuple(scan.id for scan in study.scans)
         if scans not in kept:
             kept[scans] = close(study, models)
         return kept[scans]

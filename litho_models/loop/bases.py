@@ -60,7 +60,7 @@ def bases_for(
             ``store``, settings are given for a base that is not a small model, or ``nested`` is set for a
             base that is not refitted.
     """
-    scan = study.stored[0]
+    scan = study.scans[0]
     bases: Mapping[str, nn.Module]
     if base == AUTO or base in MODELS:
         bases = base_models(base, scan, {} if base == AUTO else fields)
@@ -109,7 +109,7 @@ def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]
         trainer: function that trains a model on the scans that it receives. It must be picklable, because it
             is sent to other processes.
     """
-    seen = [exposed(scan) for scan in study.stored]
+    seen = [exposed(scan) for scan in study.scans]
     jobs = [partial(trainer, [seen[i] for i in rest]) for rest, _ in study.folds]
     # The last model is trained on all scans.
     jobs.append(partial(trainer, seen))

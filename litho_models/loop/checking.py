@@ -175,7 +175,7 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
         prediction: the prediction of the model with this cause, µm, of shape (ny, nx).
         window: the scan.
     """
-    layout = np.asarray(window.stored.layout_um, np.float64)
+    layout = np.asarray(window.layout_um, np.float64)
     # The widths of these blurs are in pixels, so that they suit the resolution of any process, including
     # films.
     near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)

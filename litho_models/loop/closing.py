@@ -232,14 +232,14 @@ def freed_scans(state: State) -> list[PreparedScan]:
     The errors to subtract from a scan are learned from the scans outside its fold.
     """
     study = state.study
-    maps, scans, freed = state.maps_um(study.scans), study.stored, [*study.scans]
+    maps, scans, freed = state.maps_um(study.scans), study.scans, [*study.scans]
     for own, held_out in study.folds:
         if len(own) < 2:
             continue
         learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
         differences = learned.between_groups()
         for i in held_out:
-            freed[i] = replace(freed[i], stored=differences.freed(scans[i], maps[i]))
+            freed[i] = differences.freed(scans[i], maps[i])
     return freed
 
 

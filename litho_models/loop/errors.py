@@ -47,7 +47,7 @@ class Fit(NamedTuple):
 
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
         """Return the map that a scan is expected to show, µm, of shape (ny, nx)."""
-        return self.measurement.expected_um(scan.stored, self.twin.height(scan))
+        return self.measurement.expected_um(scan, self.twin.height(scan))
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int, refit: bool = True) -> Fit:
@@ -61,19 +61,15 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int, r
         refit: whether to fit the model of the printer after the first fit of the measurement model. If not,
             the measurement model is fitted only once.
     """
-    stored = [scan.stored for scan in scans]
     maps = [*map(twin.height, scans)]
-    measurement = learn_measurement(stored, maps, seed=seed)
+    measurement = learn_measurement(scans, maps, seed=seed)
     if refit and len(twin.vector):
-        freed = map(measurement.freed, stored, maps)
+        freed = map(measurement.freed, scans, maps)
         # The number of a scan determines which quadrant its window covers. With consecutive numbers, the
         # windows are distributed evenly over the quadrants.
-        windows = [
-            replace(scan, stored=own, number=at).window
-            for at, (scan, own) in enumerate(zip(scans, freed, strict=True))
-        ]
+        windows = [replace(scan, number=at).window for at, scan in enumerate(freed)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
-        measurement = learn_measurement(stored, [*map(twin.height, scans)], seed=seed, like=measurement)
+        measurement = learn_measurement(scans, [*map(twin.height, scans)], seed=seed, like=measurement)
     # Strengths of groups to which none of these scans belongs were not fitted here. Their values may be from
     # the scans that are left out, so they are removed.
     return Fit(twin.known_from(scans), measurement)
@@ -126,7 +122,7 @@ def parted(study: Study, by: Parts) -> Study:
     """Return the study with its own folds (``folds``), or with one fold per print (``prints``)."""
     if by == "folds":
         return study
-    _, number = np.unique([scan.print_id for scan in study.stored], return_inverse=True)
+    _, number = np.unique([scan.print_id for scan in study.scans], return_inverse=True)
     return replace(study, fold_of=number)
 
 
@@ -140,7 +136,7 @@ class HeldOut:
 
     def __init__(self, study: Study):
         self.study = study
-        self._rows = partial(error_rows, study.stored, seed=study.seed)
+        self._rows = partial(error_rows, study.scans, seed=study.seed)
         self._by_fold = cache(self._predicted)
         # The fit of a model to all scans of the study.
         self.fit = cache(lambda state: fit_with_measurement(state.twin, study.scans, study.seed))
@@ -236,8 +232,8 @@ class HeldOut:
         study, learned = self.study, []
         for twin, (rest, _) in zip(plain.per_fold, study.folds, strict=True):
             known = [study.scans[i] for i in rest]
-            learned.append(learn_background([scan.stored for scan in known], [*map(twin.height, known)]))
-        return [learned[at].of_scan(scan) for scan, at in zip(study.stored, study.fold_of, strict=True)]
+            learned.append(learn_background(known, [*map(twin.height, known)]))
+        return [learned[at].of_scan(scan) for scan, at in zip(study.scans, study.fold_of, strict=True)]
 
 
 def nested_errors(
@@ -246,7 +242,7 @@ def nested_errors(
     """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
     print), and score its result on the scans that were left out. Return the errors on all scans.
     """
-    scans, folds, predicted = study.stored, parted(study, nested).folds, []
+    scans, folds, predicted = study.scans, parted(study, nested).folds, []
     for number, (rest, own) in enumerate(progress(folds, "repeating all choices"), 1):
         out = [scans[i] for i in own]
         names = ", ".join(scan.id for scan in out)

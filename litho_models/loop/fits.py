@@ -88,10 +88,6 @@ class Study:
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
     @property
-    def stored(self) -> list[PrintedScan]:
-        return [scan.stored for scan in self.scans]
-
-    @property
     def windows(self) -> list[PreparedScan]:
         """Return the window of each scan, i.e. the part of the scan that is used for fits and screening."""
         return [scan.window for scan in self.scans]
@@ -101,7 +97,7 @@ class Study:
         """Return the radius of the tip of the microscope, or an upper bound for this radius, µm. It is taken
         from the first scan that states it. Return None if no scan states it.
         """
-        known = (scan.stored.tip_radius_um for scan in self.scans)
+        known = (scan.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
     @property
@@ -111,14 +107,14 @@ class Study:
         For films, the positions of edges are scored instead of heights, and single scans have no height
         errors such as drift.
         """
-        return self.scans[0].stored.seen_by == "sem"
+        return self.scans[0].seen_by == "sem"
 
     @cached_property
     def groups(self) -> dict[str, Labels]:
         """Return, for each grouping of the scans, the label of the group to which each scan belongs. The
         result is keyed by the name of the grouping.
         """
-        return groupings(self.stored)
+        return groupings(self.scans)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +197,14 @@ class TwinProblem:
                     there = other.height(window, known=ChainMap({}, fields))
                     rows[at] = (window.at_sample(there) - value) / steps[at]
             linear.append(
-                Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
+                Linearised(window.residual(prediction), rows, window.free_basis(prediction, FREE_TERMS).T)
             )
         return linear
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Return the measured minus the predicted heights of all windows at the given parameters, µm."""
         twin = self.twin.at(vector)
-        return [window.height - window.at_sample(twin.height(window)) for window in self.windows]
+        return [window.residual(twin.height(window)) for window in self.windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return two arrays: the lowest and the highest allowed step of each parameter. Steps within these
@@ -242,7 +238,7 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     held_out, freed = [], []
     for fold, window in zip(study.fold_of, windows, strict=True):
         prediction = per_fold[fold].height(window)
-        held_out.append(window.height - window.at_sample(prediction))
+        held_out.append(window.residual(prediction))
         freed.append(window.freed(held_out[-1], prediction))
     return State(study, common, per_fold, linear, held_out, freed)
 

@@ -89,7 +89,7 @@ class Learner:
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
         self._study = study
         # These are the layout features that the models of the zoo use for such scans.
-        model = Features(RandomFeaturesConfig.of_variant(**common_geometry(study.stored)))
+        model = Features(RandomFeaturesConfig.of_variant(**common_geometry(study.scans)))
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
         # The facts about each scan are its position in the writing order and the deviation of its dose from
@@ -115,7 +115,7 @@ class Learner:
         """
         products = []
         for scan, own, (rows, basis, inner) in zip(self._study.scans, predictions, self._parts, strict=True):
-            residual = (scan.height - scan.at_sample(own))[:: self._every]
+            residual = scan.residual(own)[:: self._every]
             residual -= basis @ (basis.T @ residual)
             whole = np.pad(inner, [(1, 0), (1, 0)])
             whole[0, 0] = np.mean(residual**2)
@@ -133,10 +133,10 @@ class Learner:
 
         The features of position are the 25 products of five splines along y and five splines along x.
         """
-        at, (ny, nx) = scan.sample[:: self._every], scan.stored.shape
+        at, (ny, nx) = scan.sample[:: self._every], scan.shape
         y, x = np.divmod(at, nx)
         of_place = (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
-        of_layout = feature_rows(model, scan.stored, at)
+        of_layout = feature_rows(model, scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
         # Products of the height, ∂y and ∂x with the position represent a gain and a displacement that depend
         # on the position.

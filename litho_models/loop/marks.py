@@ -81,7 +81,7 @@ def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> np.ndarray:
     are elongated across the scan lines, of shape (2,). An outlier is a connected patch of pixels with large
     residuals.
     """
-    residual_um = freed_um(scan.stored.height_um, map_um, scan.usable, POLICIES["full"])
+    residual_um = freed_um(scan.height_um, map_um, scan.usable, POLICIES["full"])
     spread = median_abs_deviation(residual_um[scan.usable], scale=1 / 1.4826)
     numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
     # Patches with fewer than nine pixels count as noise. A patch counts as elongated if it is at least four
@@ -96,7 +96,7 @@ def with_bends(finding: ScanFinding, scans: Sequence[PreparedScan]) -> ScanFindi
     """Add the number of bent scans to the finding about the registration. The registration has straightened
     these scans, and all other steps of the loop use the straightened scans.
     """
-    found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
+    found_um = [scan.bend_um.largest for scan in scans if scan.bend_um is not None]
     text = f"{finding.evidence}; the registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:
         text += f", which were bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"

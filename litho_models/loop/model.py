@@ -74,7 +74,7 @@ class Slot:
 
     def is_of(self, scan: PreparedScan) -> bool:
         """Return whether the parameter applies to this scan."""
-        return label_of(scan.stored, self.by) == self.label
+        return label_of(scan, self.by) == self.label
 
 
 @dataclass(frozen=True)

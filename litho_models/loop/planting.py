@@ -56,7 +56,7 @@ def plant(
     for scan in closed.given.scans:
         here = twin.height(scan)
         added = twin.height(scan, values) - here
-        changed.append(replace(scan.stored, height_um=scan.stored.height_um + added.astype(np.float32)))
+        changed.append(replace(scan, height_um=scan.height_um + added.astype(np.float32)))
         sizes_um.append(rms(scan.freed(scan.at_sample(added), here)))
     again = close_again(changed)
     sets = ([one.name, *one.alike] for one in again.named.causes if again.needed_by_all(one))

@@ -5,8 +5,9 @@ position of each scan in the write field and in the writing order.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,39 +51,41 @@ class ExposedScan(PrintedScan):
 
 def exposed(scan: PrintedScan) -> PrintedScan:
     """Multiply the layout of a scan by its dose, because a smaller dose acts like a lower layout. The loop
-    predicts prints from the resulting layout. A scan without a dose, or with a dose of 1, is returned
-    unchanged, so that cached fits to this scan stay valid.
+    predicts prints from the resulting layout. A scan without a dose, or with a dose of 1, is returned as it
+    is in the store, so that cached fits to this scan stay valid.
     """
-    return scan if scan.dose in (None, 1) else ExposedScan(**vars(scan), exposure=float(scan.dose))
+    facts = _stored_facts(scan)
+    if scan.dose in (None, 1):
+        return PrintedScan(**facts)
+    return ExposedScan(**facts, exposure=float(scan.dose))
 
 
-@dataclass(frozen=True)
-class PreparedScan:
+def _stored_facts(scan: PrintedScan) -> dict[str, Any]:
+    """Return what the store contains about a scan, keyed by field of ``PrintedScan``."""
+    return {one.name: getattr(scan, one.name) for one in fields(PrintedScan)}
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class PreparedScan(PrintedScan):
     """A scan with the data that are needed to predict it and to compare it with predictions.
 
     Attributes:
-        stored: the scan in the store.
         context: facts about the scan that effects use, such as the exposed layout and the position in the
             write field.
         line: index of the scan line of each pixel, of shape (ny, nx).
         number: number of the scan. It determines which quadrant of the scan becomes its ``window``.
     """
 
-    stored: PrintedScan
     context: FieldContext
     line: LineIndex
     number: int
-
-    @property
-    def id(self) -> str:
-        return self.stored.id
 
     @cached_property
     def usable(self) -> np.ndarray:
         """Return the mask of the measured pixels, which are the pixels that are scored. The mask has shape
         (ny, nx).
         """
-        return self.stored.usable
+        return super().usable
 
     @cached_property
     def sample(self) -> np.ndarray:
@@ -92,11 +95,6 @@ class PreparedScan:
         return np.flatnonzero(thinned(self._inner, _SAMPLED_PX))
 
     @cached_property
-    def height(self) -> np.ndarray:
-        """Return the measured height at ``sample``, µm, float64, of shape (n,)."""
-        return self.at_sample(self.stored.height_um)
-
-    @cached_property
     def window(self) -> PreparedScan:
         """Return the part of the scan that is used for fits and screening. It is a quadrant if the scan is
         large, and otherwise the whole scan.
@@ -104,7 +102,7 @@ class PreparedScan:
         Successive scans use different quadrants, so that together they cover the whole field. A quadrant with
         few measured pixels is replaced by the quadrant that has the most measured pixels.
         """
-        shape = self.stored.shape
+        shape = self.shape
         if min(shape) < LARGE_PX:
             return self
         quadrants = [Crop(self.id, number).slices(shape) for number in (0, 2, 1, 3)]
@@ -115,24 +113,25 @@ class PreparedScan:
         rows, columns = area = tuple(
             slice(max(part.start - _MARGIN_PX, 0), part.stop + _MARGIN_PX) for part in own
         )
-        stored = replace(
-            self.stored,
-            mask_level=self.stored.mask_level[area],
-            height_um=self.stored.height_um[area],
-            valid=sampled[area],
-            height_sigma_um=None,
-        )
         context = replace(
             self.context,
             layout_um=self.context.layout_um[..., rows, columns],
             scan_shape=shape,
             origin_px=(rows.start, columns.start),
         )
-        return PreparedScan(stored, context, self.line[area], self.number)
+        return replace(
+            self,
+            mask_level=self.mask_level[area],
+            height_um=self.height_um[area],
+            valid=sampled[area],
+            height_sigma_um=None,
+            context=context,
+            line=self.line[area],
+        )
 
     @cached_property
     def _inner(self) -> np.ndarray:
-        ny, nx = self.stored.shape
+        ny, nx = self.shape
         border = sample_border_px(min(ny, nx))
         return np.pad(self.usable[border : ny - border, border : nx - border], border)
 
@@ -141,6 +140,12 @@ class PreparedScan:
         shape (n,).
         """
         return field_map.reshape(-1)[self.sample].astype(np.float64)
+
+    def residual(self, prediction_um: np.ndarray) -> np.ndarray:
+        """Return the measured minus the predicted height at the n sampled pixels, µm, float64, of shape (n,).
+        ``prediction_um`` is the predicted height, µm, of shape (ny, nx).
+        """
+        return self.at_sample(self.height_um) - self.at_sample(prediction_um)
 
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
         """Return the smooth maps of the named scan terms at the sampled pixels, for the given predicted
@@ -177,7 +182,7 @@ def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = 
     """
     orders = [scan.order for scan in scans]
     if known:
-        stated = sorted((one.stored.order, one.context.order) for one in known)
+        stated = sorted((one.order, one.context.order) for one in known)
         places = np.interp(orders, *np.transpose(stated))
     elif len(set(orders)) > 1:
         # Scans with the same position, such as two scans of one print, stay together.
@@ -204,7 +209,7 @@ def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = 
             dose=float(scan.dose or 1),
         )
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
-        prepared.append(PreparedScan(scan, context, line, number))
+        prepared.append(PreparedScan(**_stored_facts(scan), context=context, line=line, number=number))
     return prepared
 
 

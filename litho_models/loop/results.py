@@ -84,7 +84,7 @@ def record(
         fewest_scans=FEWEST_SCANS,
         gain_nm=float(np.mean(gains)),
         over_scans=over_units(gains, seed=study.seed),
-        over_prints=over_prints(gains, [scan.stored.print_id for scan in study.scans], study.seed),
+        over_prints=over_prints(gains, [scan.print_id for scan in study.scans], study.seed),
     )
 
 
@@ -172,7 +172,7 @@ def independent(scans: Sequence[PreparedScan]) -> list[str]:
     """Return, for each scan, the print to which it belongs, or the scan itself if there are too few prints.
     Confidence intervals treat the returned units as independent.
     """
-    prints = [scan.stored.print_id for scan in scans]
+    prints = [scan.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
 
 

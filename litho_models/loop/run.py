@@ -162,7 +162,7 @@ def close_loop(
         )  # fmt: skip
         for written in (result, *beside):
             written.write(folder)
-        write_report(result, study.stored, map(models.maps_um, closed.ends.values()), folder)
+        write_report(result, study.scans, map(models.maps_um, closed.ends.values()), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
     return result
 
@@ -184,7 +184,7 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     base = closed.final.twin.fitted_base
     base = base.common if isinstance(base, FoldedBase) else base
     assert isinstance(base, Simulator)
-    latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
+    latest = max(closed.study.scans, key=lambda scan: scan.order)
     values = closed.final.twin.values(latest)
     sides = {"process": "printer", "measurement": "microscope"}
 
@@ -210,8 +210,8 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
             **dict(result.split),
             "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
         },
-        training_level_share=level_share(closed.given.stored),
-        training_step_share=step_share(closed.given.stored),
+        training_level_share=level_share(closed.given.scans),
+        training_step_share=step_share(closed.given.scans),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
             {

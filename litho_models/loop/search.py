@@ -287,7 +287,7 @@ def untestable(study: Study) -> dict[str, str]:
     """Return the effects that cannot be tested with these scans, each with the reason."""
     reasons = {}
     positions = len({scan.context.order for scan in study.scans})
-    one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
+    one_level = all(np.ptp(scan.mask_level) == 0 for scan in study.scans)
     for effect in screened_effects():
         if one_level:
             reasons[effect.name] = "every layout has only one level, so nothing in the print varies"
@@ -297,7 +297,7 @@ def untestable(study: Study) -> dict[str, str]:
                 if positions == 1
                 else "the scans have only two positions in the writing order"
             )
-        elif "probe" in effect.needs and study.scans[0].stored.seen_by == "confocal":
+        elif "probe" in effect.needs and study.scans[0].seen_by == "confocal":
             reasons[effect.name] = "a confocal microscope has no probe"
     return reasons
 

@@ -73,7 +73,7 @@ class SingleScans:
         """Fit terms to each scan and return the residuals, µm."""
         blocks = Blocks(seed=self.study.seed)
         return [
-            cross_fit(scan.stored.height_um, own, scan.usable, terms, blocks, scan_line=scan.line).residual_um
+            cross_fit(scan.height_um, own, scan.usable, terms, blocks, scan_line=scan.line).residual_um
             for scan, own in zip(self.scans, self.maps_um, strict=True)
         ]
 
@@ -97,7 +97,7 @@ class SingleScans:
         effect, judgement = get_effect(name), self._judged(before, after)
         reason = judgement.reason()
         values = coefficients(self.scans, self.maps_um, terms_of_effect(name), after)
-        grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
+        grouped = by_print(values, [scan.print_id for scan in self.scans], self.study.seed)
         # If the term agrees between the scans of one print, the printer may be its cause instead of the
         # microscope.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
@@ -176,7 +176,7 @@ class SingleScans:
         if len({scan.usable.shape[1 - axis] for scan in self.scans}) > 1:
             return found
         smooth, pairs = frozenset({"offset", "bow"}), zip(self.scans, self.maps_um, strict=True)
-        left_um = [freed_um(scan.stored.height_um, own, scan.usable, smooth) for scan, own in pairs]
+        left_um = [freed_um(scan.height_um, own, scan.usable, smooth) for scan, own in pairs]
         usable = [scan.usable for scan in self.scans]
         for others, own in self.study.folds:
             total, seen = (sum(maps[i].sum(axis) for i in others) for maps in (left_um, usable))
@@ -200,7 +200,7 @@ def coefficients(
     found = []
     for scan, expected in zip(scans, maps_um, strict=True):
         design = scan.terms_at_sample(expected, terms)
-        fitted = least_squares(design, scan.height - scan.at_sample(expected))
+        fitted = least_squares(design, scan.residual(expected))
         fitted[lengths] *= scan.context.pitch_um
         found.append(fitted[kept])
     return np.stack(found)

@@ -65,7 +65,7 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
         dataset: the dataset on which the loop was closed.
         single_scans: findings of this loop about per-scan terms.
     """
-    study, stored = closed.study, closed.study.stored
+    study, stored = closed.study, closed.study.scans
     maps = closed.final.maps_um(study.scans)
     left = [*map(left_nm, study.scans, maps)]
     noise = noise_spectrum(left)

@@ -78,9 +78,9 @@ def left_nm(scan: PreparedScan, prediction_um: Array) -> Array:
 
     Pixels that were not measured are NaN.
     """
-    at = inner(scan.stored.shape)
+    at = inner(scan.shape)
     used = scan.usable[at]
-    freed = freed_um(scan.stored.height_um[at], prediction_um[at], used, ALL_FREE)
+    freed = freed_um(scan.height_um[at], prediction_um[at], used, ALL_FREE)
     return np.where(used, NM_PER_UM * freed, np.nan)
 
 

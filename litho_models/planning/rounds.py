@@ -183,7 +183,7 @@ class Judge:
         own = terms_of_effect(question.name)
         maps = [self.twin.height(scan) for scan in self.new]
         found = coefficients(self.new, maps, own, own | {"offset", "gain", "bow"})
-        prints = np.array([scan.stored.print_id for scan in self.new])
+        prints = np.array([scan.print_id for scan in self.new])
         by_print = [found[prints == one] for one in np.unique(prints)]
         repeated = [one for one in by_print if len(one) > 1]
         count, total = len(repeated), sum(map(len, repeated))
@@ -209,7 +209,7 @@ class Judge:
         rows, lines = [], 0
         for scan in turned:
             used = scan.usable
-            residual = freed_um(scan.stored.height_um, self.twin.height(scan), used, frozenset({"offset"}))
+            residual = freed_um(scan.height_um, self.twin.height(scan), used, frozenset({"offset"}))
             indices = row_index(used.shape), scan.line
             offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in indices)
             rows.append([*offsets, residual[used].var() / used.shape[1]])
@@ -310,7 +310,7 @@ def _compare(
     for scan, first, second in zip(new, *(left_nm[name] for name in pair), strict=True):
         pixels += int(np.isfinite(first).sum())
         difference += float(np.nansum((second - first) ** 2))
-        key = scan.stored.print_id, first.shape
+        key = scan.print_id, first.shape
         by_print[key] = by_print.get(key, 0.0) + _block_sums(second**2 - first**2)
     total = float(sum(sums.sum() for sums in by_print.values()))
     # The mean over the blocks of a print counts as the result of this print. The scatter of the blocks about
@@ -368,7 +368,7 @@ def _decision(
         left=left,
         verdict=verdict or ("decided" if len(left) == 1 else "still open"),
         evidence=evidence,
-        prints=len({scan.stored.print_id for scan in scans}),
+        prints=len({scan.print_id for scan in scans}),
         scans=len(scans),
         comparisons=comparisons,
     )

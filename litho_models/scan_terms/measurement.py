@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -27,6 +27,7 @@ from litho_models.scan_terms.term import FloatMap
 
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
+Scan = TypeVar("Scan", bound=PrintedScan)
 # The displacements, in the order of the axes.
 _SHIFTS = ("shift-y", "shift-x")
 
@@ -120,7 +121,7 @@ class MeasurementModel(Record):
                 seen = seen + part.of(scan)[0] * (seen - seen.mean())
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
-    def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
+    def freed(self, scan: Scan, prediction_um: np.ndarray) -> Scan:
         """Return the scan minus the changes that this model makes to the predicted height. ``prediction_um``
         is the predicted height of the print, µm, of shape (ny, nx).
         """

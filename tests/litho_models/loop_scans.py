@@ -100,8 +100,7 @@ def planted(
     for name, by, values in effects:
         twin = twin.with_effect(name, by, values)
     heights = [
-        twin.height(scan) + 0.02 * rng.normal() + rng.normal(0, noise_um, scan.stored.shape)
-        for scan in prepared
+        twin.height(scan) + 0.02 * rng.normal() + rng.normal(0, noise_um, scan.shape) for scan in prepared
     ]
     return with_heights(scans, heights)
 

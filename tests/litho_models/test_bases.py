@@ -138,11 +138,11 @@ def test_a_trained_base_learns_what_the_printer_does_with_an_exposure() -> None:
     bare = Twin.bare(base_model())
     truth = [1.3 * bare.height(scan) + 0.01 for scan in study.scans]
     learned = Twin.bare(train_folds(study_of(with_heights(scans, truth)), fitted))
-    for scan, own in zip(study.scans, truth, strict=True):
-        np.testing.assert_allclose(learned.height(scan), own, atol=1e-5)
+    for scan, prepared, own in zip(scans, study.scans, truth, strict=True):
+        np.testing.assert_allclose(learned.height(prepared), own, atol=1e-5)
         # A fit to nominal layouts must not be taken from the cache for a fit to exposures.
-        assert scan_sha256(exposed(scan.stored)) != scan_sha256(scan.stored)
-        assert exposed(replace(scan.stored, dose=1.0)).layout_um.max() == scan.stored.layout_um.max()
+        assert scan_sha256(exposed(scan)) != scan_sha256(scan)
+        assert exposed(replace(scan, dose=1.0)).layout_um.max() == scan.layout_um.max()
 
 
 class Carrying(nn.Module):

@@ -57,14 +57,14 @@ def changed(study: Study, predictions: list[np.ndarray], change: Change) -> list
 
 def bead(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     """Return a bead of a few nanometres on slopes along x. The bead is proportional to the height."""
-    return 0.02 * prediction * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=1))
+    return 0.02 * prediction * np.abs(np.gradient(prediction, scan.pitch_um, axis=1))
 
 
 def later(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     """Return a change that is proportional to slopes along y and occurs only in the second half of the
     scans.
     """
-    return 0.03 * (scan.context.order > 0) * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=0))
+    return 0.03 * (scan.context.order > 0) * np.abs(np.gradient(prediction, scan.pitch_um, axis=0))
 
 
 def placed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
@@ -120,8 +120,8 @@ def test_two_folds_are_enough(scene, rest_without) -> None:
 def test_only_height_slopes_and_surroundings_may_depend_on_the_order(scene) -> None:
     """Check these features, because the learner finds them by their index in a default model."""
     scan = scene[0].scans[0]
-    rows = feature_rows(build_model("features"), scan.stored, scan.sample)
-    layout, pitch = scan.stored.layout_um / 1.2, scan.stored.pitch_um
+    rows = feature_rows(build_model("features"), scan, scan.sample)
+    layout, pitch = scan.layout_um / 1.2, scan.pitch_um
     height, near = (gaussian_filter(layout, sigma / pitch, mode="nearest") for sigma in (0.3, 1.6))
     slopes = [np.abs(slope) for slope in np.gradient(height, pitch)]
     for number, expected in zip(module._VARYING, (height, *slopes, near), strict=True):
@@ -148,9 +148,7 @@ def test_a_shift_of_the_registration_is_nothing_to_learn(scene) -> None:
 def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scene, rest_without) -> None:
     study, predictions, _ = scene
     tilted = [
-        replace(
-            scan.stored, height_um=scan.stored.height_um + 1e-3 * np.arange(scan.stored.shape[1]) + 0.02 * at
-        )
+        replace(scan, height_um=scan.height_um + 1e-3 * np.arange(scan.shape[1]) + 0.02 * at)
         for at, scan in enumerate(study.scans)
     ]
     plain = rest_without(None)

@@ -67,8 +67,8 @@ def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() ->
     change, prediction, layout = rng.random((3, 48, 40))
 
     def shapes(pitch_um: float) -> list[np.ndarray]:
-        stored, context = SimpleNamespace(layout_um=layout), SimpleNamespace(pitch_um=pitch_um)
-        return checking._shapes(change, prediction, SimpleNamespace(stored=stored, context=context))
+        context = SimpleNamespace(pitch_um=pitch_um)
+        return checking._shapes(change, prediction, SimpleNamespace(layout_um=layout, context=context))
 
     coarse, fine = shapes(0.1), shapes(0.004)
     assert all(np.allclose(a, b) for a, b in zip(coarse[:-4], fine[:-4], strict=True))

@@ -49,7 +49,7 @@ def test_the_bare_twin_is_the_base(study) -> None:
     bare = Twin.bare(base_model())
     np.testing.assert_allclose(bare.vector, [0.9, 0.03], rtol=1e-6)
     assert bare.names == ()
-    blurred = gaussian_filter(scan.stored.layout_um, BLUR_UM / PITCH_UM, mode="nearest", truncate=4)
+    blurred = gaussian_filter(scan.layout_um, BLUR_UM / PITCH_UM, mode="nearest", truncate=4)
     np.testing.assert_allclose(bare.height(scan), 0.9 * blurred + 0.03, atol=1e-5)
 
 
@@ -67,21 +67,19 @@ def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin, study) -> None
 
 
 def test_a_group_that_was_never_fitted_has_the_mean_of_the_others(twin: Twin, study) -> None:
-    stored = replace(study.scans[0].stored, groups={"field": "9"})
-    elsewhere = replace(study.scans[0], stored=stored)
+    elsewhere = replace(study.scans[0], groups={"field": "9"})
     assert twin.values(elsewhere)[THINNING]["along_x_um"] == pytest.approx(0.15)
     one = Twin.bare(base_model()).with_effect(THINNING, ALL, {"": thinning(0.15)})
     np.testing.assert_allclose(twin.height(elsewhere), one.height(elsewhere), atol=1e-6)
 
 
 def test_a_group_without_scans_has_the_mean_of_the_others(twin: Twin, study) -> None:
-    first = [scan for scan in study.scans if scan.stored.groups["field"] == "1"]
+    first = [scan for scan in study.scans if scan.groups["field"] == "1"]
     known = twin.known_from(first)
     assert known.values(study.scans[1]) == known.values(study.scans[0]) == {THINNING: thinning(0.1)}
     assert len(known.vector) == len(twin.vector) - 2
     assert np.array_equal(twin.known_from(study.scans).vector, twin.vector)
-    stored = replace(study.scans[0].stored, groups={"field": "9"})
-    elsewhere = replace(study.scans[0], stored=stored)
+    elsewhere = replace(study.scans[0], groups={"field": "9"})
     # Without a strength, the effect does nothing.
     assert twin.known_from([elsewhere]).chain(elsewhere).values[THINNING]["along_x_um"] == 0.0
 
@@ -137,7 +135,7 @@ def test_derivatives_are_difference_quotients_of_the_whole_prediction(twin: Twin
     linear = TwinProblem(twin, study.windows).linearise(twin.vector)
     for window, part in zip(study.windows, linear, strict=True):
         here = window.at_sample(twin.height(window))
-        np.testing.assert_allclose(part.residual, window.height - here, atol=1e-12)
+        np.testing.assert_allclose(part.residual, window.at_sample(window.height_um) - here, atol=1e-12)
         for at, step in enumerate(steps):
             moved = twin.vector.copy()
             moved[at] += step
@@ -194,7 +192,7 @@ def test_free_errors_are_those_of_the_fit_that_has_not_seen_the_scan(study) -> N
     for at, scan in enumerate(study.scans):
         fold = study.fold_of[at]
         prediction = state.per_fold[fold].height(scan)
-        left = scan.height - scan.at_sample(prediction)
+        left = scan.residual(prediction)
         np.testing.assert_allclose(state.held_out_um[at], left, atol=1e-12)
         freed = scan.freed(left, prediction)
         assert state.freed_nm2[at] == pytest.approx(1e6 * np.mean(freed**2))
@@ -251,7 +249,7 @@ def test_scans_of_the_same_position_in_the_order_stay_together() -> None:
 
 def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
     """Check that new scans get positions in the known printing order, so that a drift continues."""
-    stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]
+    stored = [study.scans[3], replace(study.scans[6], order=7)]
     found = prepare_scans(stored, study.scans)
     assert [one.context.order for one in found] == [
         study.scans[3].context.order,

@@ -213,7 +213,7 @@ def test_only_what_is_the_printers_is_exported(closed, store: Path, tmp_path: Pa
     twin = Twin.bare(base_model())
     for name in roles_of:
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values({})})
-    study = SimpleNamespace(scans=scans, stored=[scan.stored for scan in scans])
+    study = SimpleNamespace(scans=scans)
     found = SimpleNamespace(final=SimpleNamespace(twin=twin), study=study, given=study)
     effects = [SimpleNamespace(name=n, role=role, confusable_with=[]) for n, role in roles_of.items()]
     save_model(found, result.model_copy(update={"effects": effects}), opened, tmp_path / "model")  # type: ignore[arg-type]
@@ -357,14 +357,14 @@ def test_a_scan_is_freed_by_what_the_others_say() -> None:
     bowed = with_heights(scans, [s.height_um + bow for s, bow in zip(scans, bows, strict=True)])
     study = study_of(bowed)
     state = bare_state(study)
-    freed = [one.stored for one in freed_scans(state)]
+    freed = freed_scans(state)
     taken = [one.height_um - other.height_um for one, other in zip(bowed, freed, strict=True)]
     # Each field gets half of the difference between the fields, reduced by shrinkage.
     for scan, own in zip(bowed, taken, strict=True):
         sign = 1 if scan.groups["field"] == "2" else -1
         assert np.corrcoef(own.ravel(), sign * _bow(scan.shape).ravel())[0, 1] > 0.9
     other = [replace(bowed[0], height_um=bowed[0].height_um + _bow(bowed[0].shape)), *bowed[1:]]
-    again = [one.stored for one in freed_scans(replace(state, study=study_of(other)))]
+    again = freed_scans(replace(state, study=study_of(other)))
     np.testing.assert_allclose(other[0].height_um - again[0].height_um, taken[0], atol=1e-6)
     assert np.abs(other[1].height_um - again[1].height_um - taken[1]).max() > 1e-4
 

@@ -249,7 +249,7 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
     scale = 0.01 / np.std(noise)
     heights = [scan.layout_um + scale * own for scan, own in zip(blank, noise, strict=True)]
     scans = prepare_scans(with_heights(blank, heights))
-    spectrum = noise_spectrum([left_nm(scan, scan.stored.layout_um) for scan in scans])
+    spectrum = noise_spectrum([left_nm(scan, scan.layout_um) for scan in scans])
     # The terms of each scan absorb some of the slow noise, and four scans give only few tiles.
     assert np.sqrt(np.mean(spectrum.power_nm2)) == pytest.approx(10.0, rel=0.1)
     for sigma in ((0, 2), (2, 0)):
@@ -843,7 +843,7 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
     scans = prepare_scans(planted([(name, ALL, {"": SLOPE[name]})], count=4))
     assert {len(scan.sample) for scan in scans} == {36 * 36}
     monkeypatch.setattr(prepared, "_SAMPLED_PX", len(scans[0].sample) // 4)
-    few = prepare_scans([scan.stored for scan in scans])
+    few = prepare_scans(scans)
     known = []
     for study in (scans, few):
         own = SimpleNamespace(windows=study, scans=scans, report=lambda message: None)

@@ -47,7 +47,7 @@ def found_with(
     scans = planted(size_px=size_px, seed=seed)
     if turned:
         scans = [replace(scan, scan_to_layout=TURNED) for scan in scans]
-    heights = [scan.stored.height_um + change(scan, random) for scan in prepare_scans(scans)]
+    heights = [scan.height_um + change(scan, random) for scan in prepare_scans(scans)]
     scans = with_heights(scans, heights)
     study = study_of(scans)
     maps = truths(study.scans)
@@ -125,11 +125,11 @@ def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None
 def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
     def bent(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
         # The rim is displaced by 0.1 µm relative to the middle, with zero mean and equal or varying signs.
-        size_um = 0.1 if shared else 0.1 * SIGNS[scan.stored.order]
-        height = np.asarray(scan.stored.height_um, np.float64)
+        size_um = 0.1 if shared else 0.1 * SIGNS[scan.order]
+        height = np.asarray(scan.height_um, np.float64)
         rows, columns = np.indices(height.shape, dtype=float)
         across = np.linspace(-1, 1, height.shape[1])
-        moved = columns + size_um * (across**2 - 1 / 3) / scan.stored.pitch_um
+        moved = columns + size_um * (across**2 - 1 / 3) / scan.pitch_um
         return map_coordinates(height, [rows, moved], order=3, mode="nearest") - height
 
     found = found_with(bent, SMALL_PX, shared_known=shared)["registration-residual"]
@@ -148,8 +148,8 @@ def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints
     gains = gains if of_prints else np.roll(gains, 1)
 
     def stretched(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
-        height = scan.stored.height_um
-        return gains[scan.stored.order] * (height - height.mean())
+        height = scan.height_um
+        return gains[scan.order] * (height - height.mean())
 
     one = found_with(stretched, SMALL_PX)["z-gain"]
     assert one.seen
@@ -187,7 +187,7 @@ def test_marks_are_listed_beside_the_terms() -> None:
     study = study_of(planted(size_px=SMALL_PX))
     maps = truths(study.scans)
     bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (SMALL_PX, SMALL_PX), (0.1, 0.1))
-    bent = [replace(one, stored=replace(one.stored, bend_um=bend)) for one in study.scans]
+    bent = [replace(one, bend_um=bend) for one in study.scans]
     found = {one.name: one for one in SingleScans(replace(study, scans=bent), maps).findings()}
     assert "scars-and-spikes" in found
     assert f"straightened {len(bent)} of {len(bent)} scans" in found["registration-residual"].evidence
