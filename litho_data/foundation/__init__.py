@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from litho_data.foundation.kinds import Array as Array
     from litho_data.foundation.kinds import Facts as Facts
     from litho_data.foundation.kinds import Shape as Shape
+    from litho_data.foundation.units import NM_PER_UM as NM_PER_UM
     from litho_data.foundation.units import is_length as is_length
     from litho_data.foundation.units import um_per as um_per
 else:

@@ -8,13 +8,11 @@ in all scans of a group): the confidence interval of the reduction must lie abov
 must be large enough to matter (see ``SMALLEST_SHARE``).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM, Array
 from litho_models.loop.fits import State, Study
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
@@ -53,7 +51,7 @@ class Judgement:
 
     before_nm2: float
     gain_nm2: float
-    gains_nm2: np.ndarray
+    gains_nm2: Array
     p: float
     low_nm2: float
 
@@ -83,9 +81,7 @@ class Judgement:
         return ""
 
 
-def judge(
-    before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study, evidence_nm2: np.ndarray | None = None
-) -> Judgement:
+def judge(before_nm2: Array, after_nm2: Array, study: Study, evidence_nm2: Array | None = None) -> Judgement:
     """Judge a change of the model on held-out scans.
 
     Args:
@@ -106,7 +102,7 @@ def judge_states(before: State, after: State) -> Judgement:
     return judge(before.freed_nm2, after.freed_nm2, after.study, np.array([*evidence]))
 
 
-def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
+def evidence_nm2(before_um: Array, after_um: Array) -> float:
     """Multiply the change of a prediction by the residual before this change, pixel by pixel. Return the mean
     of the product, nm². Pixels that were not measured are ignored.
 

@@ -5,17 +5,14 @@ shows whether the residual has structure that could be learned, and by how much 
 This decrease can be compared with the decrease that a cause achieves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM, Array
 from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.least_squares import gram, orthonormal
 from litho_models.fitting.ridge import feature_rows
@@ -47,8 +44,8 @@ class Rest:
             both arrays are computed after the free terms of each scan have been projected out.
     """
 
-    gains_nm2: np.ndarray
-    squares_nm2: np.ndarray
+    gains_nm2: Array
+    squares_nm2: Array
 
     @property
     def mean_nm2(self) -> float:
@@ -86,7 +83,7 @@ class Learner:
             the free terms (such as the gain).
     """
 
-    def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
+    def __init__(self, study: Study, predictions: Sequence[Array]):
         self._study = study
         # These are the layout features that the models of the zoo use for such scans.
         model = Features(RandomFeaturesConfig.of_variant(**common_geometry(study.scans)))
@@ -105,7 +102,7 @@ class Learner:
             basis = orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
             self._parts.append((rows, basis, gram(rows.T.astype(np.float64), basis) / len(basis)))
 
-    def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
+    def rest(self, predictions: Sequence[Array]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
         fitted to the scans of other folds. Return the part that the regression explains.
 
@@ -126,10 +123,10 @@ class Learner:
         squares = grams[:, 0, 0] * NM_PER_UM**2
         return Rest(squares - left, squares)
 
-    def _rows(self, model: Features, scan: PreparedScan, varied: np.ndarray) -> NDArray[np.float32]:
+    def _rows(self, model: Features, scan: PreparedScan, varied: Array) -> Array:
         """Return the m features at n pixels of a scan: the features of layout and position, some of their
-        products, and products of some features with the writing order and the dose. The result has shape (m,
-        n).
+        products, and products of some features with the writing order and the dose. The result is float32
+        of shape (m, n).
 
         The features of position are the 25 products of five splines along y and five splines along x.
         """
@@ -146,7 +143,7 @@ class Learner:
         return np.concatenate(columns).astype(np.float32)
 
 
-def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
+def _held_out(grams: Array, fold_of: Array) -> Array:
     """Return the mean squared residual that the ridge regression leaves in each scan. For each scan, the
     regression is fitted, and its regularisation is chosen, without the scans of the same fold. If only one
     scan is left for the fit, the strengths of the regularisation cannot be compared, and the first of them is
@@ -165,7 +162,7 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     return left
 
 
-def _splines(size: int) -> np.ndarray:
+def _splines(size: int) -> Array:
     """Return five cubic splines along an axis with ``size`` pixels. Their sum is 1 at every pixel, and their
     knots divide the part of the axis that is used for fits. The result has shape (5, size).
 

@@ -2,15 +2,12 @@
 finds it there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM, InputError
 from litho_data.store import PrintedScan
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.closing import Closed

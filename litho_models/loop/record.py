@@ -2,8 +2,6 @@
 ``close_loop.json`` (schema 4). The report and its tables are made from this record.
 """
 
-from __future__ import annotations
-
 from statistics import fmean
 from typing import Any, ClassVar, Literal
 
@@ -15,7 +13,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.policies import Policy, usual_policy
-from litho_models.scoring.statistics import OverUnits
+from litho_models.scoring.statistics import Interval, OverUnits
 from litho_models.splits.folds import Split
 
 Verdict = Literal["traced", "described", "nothing-missing", "unexplained", "too-few-scans"]
@@ -68,7 +66,7 @@ class ErrorRow(Record):
     printer_numbers: int
     measurement_numbers: int
     mae_nm: float
-    mae_ci95_nm: tuple[float, float] | None
+    mae_ci95_nm: Interval
     rmse_nm: float
     by_scan_nm: dict[str, float]
     edge_by_scan_nm: dict[str, float]
@@ -105,7 +103,7 @@ class Strength(Record):
     label: str = ""
     value: float
     unit: str
-    ci95: tuple[float, float] | None = None
+    ci95: Interval = None
 
 
 class FoundEffect(Record):

@@ -1,13 +1,11 @@
 """Write the report of a loop from its record."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM
 from litho_data.reports.page import Page, sentences
 from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
 from litho_data.store import PrintedScan
@@ -44,21 +42,25 @@ def write_report(
     if result.effects:
         page.heading("What was found")
         page.points([said("effect", one) for one in result.effects])
-        columns = (
-            "name",
-            "knowledge",
-            "verdict",
-            "role",
-            "by",
-            "gain_nm2",
-            "left_out_nm",
-            "p_confirm",
-            "family_p",
-            "confusable_with",
-        )
-        page.table(result.effects, "Effects added to the model.", "effects.csv", columns=columns)
         page.table(
-            [row for one in result.effects for row in _strength_rows(one)],
+            result.effects,
+            "Effects added to the model.",
+            "effects.csv",
+            columns=(
+                "name",
+                "knowledge",
+                "verdict",
+                "role",
+                "by",
+                "gain_nm2",
+                "left_out_nm",
+                "p_confirm",
+                "family_p",
+                "confusable_with",
+            ),
+        )
+        page.table(
+            _strength_rows(result.effects),
             "Fitted parameters of these effects, with 95 % confidence intervals from the scatter over prints "
             "(or over scans, if there are too few prints).",
             "strengths.csv",
@@ -132,7 +134,7 @@ def _residuals(page: Page, scans: Sequence[PrintedScan], maps_um: Iterable[Seque
     )
 
 
-def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
+def _strength_rows(effects: Sequence[FoundEffect]) -> list[dict[str, object]]:
     return [
         {
             "effect": one.name,
@@ -143,6 +145,7 @@ def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
             "from": low,
             "to": high,
         }
+        for one in effects
         for name, strengths in one.strengths.items()
         for own in strengths
         for low, high in [own.ci95 or (None, None)]

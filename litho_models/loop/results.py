@@ -2,8 +2,6 @@
 rejected effects. The strengths of the effects have confidence intervals, and each rejection has a reason.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import Any
