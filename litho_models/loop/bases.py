@@ -2,8 +2,6 @@
 that the user asked for, or several small models.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from operator import call
@@ -13,7 +11,7 @@ from typing import Any
 from torch import nn
 
 from litho_data.commands.progress import progress
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan, Store
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
@@ -109,12 +107,9 @@ def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]
         trainer: function that trains a model on the scans that it receives. It must be picklable, because it
             is sent to other processes.
     """
-    seen = [exposed(scan) for scan in study.scans]
-    jobs = [partial(trainer, [seen[i] for i in rest]) for rest, _ in study.folds]
     # The last model is trained on all scans.
-    jobs.append(partial(trainer, seen))
+    jobs = [partial(trainer, [*map(exposed, known)]) for known in (*study.others, study.scans)]
     done = run_jobs(call, jobs, study.workers, name=lambda job: f"fold {jobs.index(job)}")
     trained = dict(progress(done, "training the base model", len(jobs)))
-    *models, common = (trained[job].model for job in jobs)
-    fold_of = dict(zip((scan.id for scan in seen), study.fold_of.tolist(), strict=True))
-    return FoldedBase(models, fold_of, common)
+    fold_of = dict(zip((scan.id for scan in study.scans), study.fold_of.tolist(), strict=True))
+    return FoldedBase([trained[job].model for job in jobs], fold_of)

@@ -2,8 +2,6 @@
 and a measurement model (of the microscope) is fitted together with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -13,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from litho_data.commands.progress import progress
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import fit_least_squares
@@ -218,8 +216,8 @@ class HeldOut:
         study = parted(self.study, by)
         starts = state.per_fold if by == "folds" else [state.twin] * len(study.folds)
         jobs = [
-            partial(fit_with_measurement, twin, [study.scans[i] for i in rest], study.seed, refit)
-            for twin, (rest, _) in zip(starts, study.folds, strict=True)
+            partial(fit_with_measurement, twin, known, study.seed, refit)
+            for twin, known in zip(starts, study.others, strict=True)
         ]
         fits = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}"))
         maps = [fits[jobs[at]].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
@@ -229,10 +227,11 @@ class HeldOut:
         """Return the smooth background on each scan, µm, of shape (ny, nx). It is learned from the scans of
         the other folds, as in the benchmark.
         """
-        study, learned = self.study, []
-        for twin, (rest, _) in zip(plain.per_fold, study.folds, strict=True):
-            known = [study.scans[i] for i in rest]
-            learned.append(learn_background(known, [*map(twin.height, known)]))
+        study = self.study
+        learned = [
+            learn_background(known, [*map(twin.height, known)])
+            for twin, known in zip(plain.per_fold, study.others, strict=True)
+        ]
         return [learned[at].of_scan(scan) for scan, at in zip(study.scans, study.fold_of, strict=True)]
 
 

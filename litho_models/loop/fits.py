@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM, Array
 from litho_data.sharing.workers import HERE, Workers
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import field_of
 from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import (
     Linearised,
+    Room,
     Rules,
     eliminated_sum,
     fit_least_squares,
@@ -55,7 +56,7 @@ class Study:
     """
 
     scans: Sequence[PreparedScan]
-    fold_of: np.ndarray
+    fold_of: Array
     seed: int = 0
     workers: Workers = HERE
     report: Callable[[str], None] = _silent
@@ -86,6 +87,11 @@ class Study:
         """Return two lists of scan indices per fold: the scans outside the fold, and the scans inside it."""
         own = (self.fold_of == fold for fold in np.unique(self.fold_of))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
+
+    @property
+    def others(self) -> list[list[PreparedScan]]:
+        """Return, for each fold, the scans outside this fold."""
+        return [[self.scans[i] for i in rest] for rest, _ in self.folds]
 
     @property
     def windows(self) -> list[PreparedScan]:
@@ -136,14 +142,11 @@ class State:
     twin: Twin
     per_fold: list[Twin]
     linear: list[Linearised]
-    held_out_um: list[np.ndarray]
-    freed_um: list[np.ndarray]
-    # Cache of models without one of the effects, keyed by the name of this effect. Several steps of the loop
-    # need the same model.
-    _without: dict[str, State] = field(default_factory=dict, init=False)
+    held_out_um: list[Array]
+    freed_um: list[Array]
 
     @cached_property
-    def freed_nm2(self) -> np.ndarray:
+    def freed_nm2(self) -> Array:
         """Return the mean square of ``freed_um`` for each scan, nm², of shape (scans,)."""
         return np.array([NM_PER_UM**2 * np.mean(left**2) for left in self.freed_um])
 
@@ -155,13 +158,14 @@ class State:
         """Leave out the study with its scans when a state is sent to another process."""
         return {**self.__dict__, "study": None}
 
-    def without(self, name: str) -> State:
-        """Return the model without the named effect, refitted from the current parameters."""
-        if name not in self._without:
-            self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
-        return self._without[name]
+    @cached_property
+    def without(self) -> Callable[[str], State]:
+        """Return a function that returns the model without the named effect, refitted from the current
+        parameters. Several steps of the loop need the same model, so the function keeps its results.
+        """
+        return cache(lambda name: fit_state(self.twin.without(name), self.study, from_here=True))
 
-    def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
+    def maps_um(self, scans: Sequence[PreparedScan]) -> list[Array]:
         """Predict the height of the print in each scan (or window), µm, of shape (ny, nx). Each prediction is
         made by the model that was fitted without the fold of this scan.
         """
@@ -179,7 +183,7 @@ class TwinProblem:
     twin: Twin
     windows: Sequence[PreparedScan]
 
-    def linearise(self, vector: np.ndarray) -> list[Linearised]:
+    def linearise(self, vector: Array) -> list[Linearised]:
         """Return the residuals, the derivatives and the free terms of all windows at the given parameters."""
         here = self.twin.at(vector)
         steps = here.steps()
@@ -201,12 +205,12 @@ class TwinProblem:
             )
         return linear
 
-    def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
+    def residuals(self, vector: Array) -> list[Array]:
         """Return the measured minus the predicted heights of all windows at the given parameters, µm."""
         twin = self.twin.at(vector)
         return [window.residual(twin.height(window)) for window in self.windows]
 
-    def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def room(self, vector: Array) -> Room:
         """Return two arrays: the lowest and the highest allowed step of each parameter. Steps within these
         limits keep all parameters within their ranges and change the parameters of the base only by small
         amounts.
@@ -243,7 +247,7 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     return State(study, common, per_fold, linear, held_out, freed)
 
 
-def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
+def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> Array:
     """Return the better of two starts of a fit. The first start has the current parameters. In the second
     start, the parameters of the base have their default values instead.
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from litho_data.foundation import Array
 from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain, Fields, Frame
 from litho_models.effects.effect import Kind
@@ -35,14 +36,13 @@ class FoldedBase(nn.Module):
 
     Args:
         models: one model per fold, in the order of the folds. Each was trained without the scans of its fold.
+            One more model, the last, was trained on all scans. It predicts scans that belong to no fold.
         fold_of: number of the fold of each scan, keyed by scan id.
-        common: model that predicts scans that belong to no fold.
     """
 
-    def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
+    def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int]):
         super().__init__()
         self.models = nn.ModuleList(models)
-        self.common = common
         self.fold_of = fold_of
         # The trained weights are used as they are. They are not converted into a frozen model, because this
         # would change their rounding.
@@ -50,10 +50,9 @@ class FoldedBase(nn.Module):
 
     def of_scan(self, scan_id: str) -> nn.Module:
         """Return the model that was trained without this scan. For a scan that belongs to no fold, return the
-        common model.
+        model that was trained on all scans.
         """
-        fold = self.fold_of.get(scan_id)
-        return self.common if fold is None else self.models[fold]
+        return self.models[self.fold_of.get(scan_id, -1)]
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ class Twin:
     """
 
     base: nn.Module
-    numbers: np.ndarray
+    numbers: Array
     effects: Mapping[Slot, float] = field(default_factory=dict)
     frames: Mapping[str, Frame] = field(default_factory=dict)
 
@@ -119,13 +118,13 @@ class Twin:
         return [slot for slot in self.effects if slot.facts.kind != "choice"]
 
     @cached_property
-    def vector(self) -> np.ndarray:
+    def vector(self) -> Array:
         """Return the values of all p fitted parameters: first those of the base, then those of the effects.
         The result has shape (p,).
         """
         return np.concatenate([self.numbers, [self.effects[slot] for slot in self.slots]])
 
-    def at(self, vector: np.ndarray) -> Twin:
+    def at(self, vector: Array) -> Twin:
         """Return the same twin with the given values of all fitted parameters."""
         fitted = zip(self.slots, vector[self.own :].tolist(), strict=True)
         return replace(self, numbers=vector[: self.own], effects={**self.effects, **dict(fitted)})
@@ -196,18 +195,17 @@ class Twin:
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
         """Return the base and the effects as a chain that predicts one scan. If no scan is given, strengths
-        that differ by group are replaced by their means over the groups. ``extra`` contains the parameter
-        values of a further effect to try, keyed by the name of the effect.
+        that differ by group are replaced by their means over the groups, and a base that was trained once for
+        each fold by its model of all scans. ``extra`` contains the parameter values of a further effect to
+        try, keyed by the name of the effect.
         """
         base = self.fitted_base
-        if scan is not None and isinstance(base, FoldedBase):
-            base = base.of_scan(scan.id)
+        if isinstance(base, FoldedBase):
+            base = base.of_scan(scan.id if scan else "")
         return EffectChain(base, {**self.values(scan), **(extra or {})}, self.frames)
 
     @torch.no_grad()
-    def height(
-        self, scan: PreparedScan, extra: Values | None = None, known: Fields | None = None
-    ) -> np.ndarray:
+    def height(self, scan: PreparedScan, extra: Values | None = None, known: Fields | None = None) -> Array:
         """Return the predicted height of the print in a scan, µm, of shape (ny, nx).
 
         Args:
@@ -219,7 +217,7 @@ class Twin:
         chain, context = self.chain(scan, extra), scan.context
         return chain(context.layout_um, context, known, self.numbers.tobytes())[0, 0].numpy()
 
-    def steps(self) -> np.ndarray:
+    def steps(self) -> Array:
         """Return the step by which each parameter is changed to compute a difference quotient. A step is
         negative only if the parameter is near its upper bound. The result has shape (p,).
         """
@@ -231,7 +229,7 @@ class Twin:
             steps.append(size if self.effects[slot] + size <= facts.upper else -size)
         return np.array(steps)
 
-    def room(self) -> tuple[np.ndarray, np.ndarray]:
+    def room(self) -> tuple[Array, Array]:
         """Return two arrays of shape (p,): the lowest and the highest allowed step of each parameter. Steps
         within these limits keep the parameters of the base and of the effects within their ranges.
         """
@@ -240,22 +238,22 @@ class Twin:
         lowest, highest = np.hstack([base, ends - self.vector[self.own :]])
         return np.minimum(lowest, 0), np.maximum(highest, 0)
 
-    def free(self) -> np.ndarray:
+    def free(self) -> Array:
         """Return a mask of the fitted parameters that do not lie on a bound. The mask has shape (p,)."""
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
     def at_limits(self, name: str, kind: Kind) -> str:
         """Return the names, separated by commas, of the parameters of an effect that lie on a limit of their
-        range in at least one group. The null value does not count as a limit. If ``kind`` is ``amplitude``,
-        all amplitudes are examined. If ``kind`` is ``shape``, only lengths, such as ranges and depths, are
-        examined.
+        range in at least one group. The value ``Parameter.off`` does not count as a limit. If ``kind`` is
+        ``amplitude``, all amplitudes are examined. If ``kind`` is ``shape``, only lengths, such as ranges and
+        depths, are examined.
         """
         found = []
         for slot in self.slots:
             facts = slot.facts
             counts = kind == "amplitude" or facts.unit in ("µm", "px")
-            limits = [*{facts.lower, facts.upper} - ({facts.null} if kind == "amplitude" else set())]
+            limits = [*{facts.lower, facts.upper} - {facts.off}]
             at_limit = np.isclose(self.effects[slot], limits, _AT_BOUND, _AT_BOUND).any()
             if slot.effect == name and facts.kind == kind and counts and at_limit:
                 found.append(slot.parameter)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
+from litho_data.foundation import Array
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
 from litho_models.fitting.crops import part_to_fit
@@ -44,7 +45,7 @@ class ExposedScan(PrintedScan):
     exposure: float = 1.0
 
     @property
-    def layout_um(self) -> np.ndarray:
+    def layout_um(self) -> Array:
         """Return the exposed height of each pixel in µm, a float32 array of shape (ny, nx)."""
         return super().layout_um * np.float32(self.exposure)
 
@@ -81,14 +82,7 @@ class PreparedScan(PrintedScan):
     number: int
 
     @cached_property
-    def usable(self) -> np.ndarray:
-        """Return the mask of the measured pixels, which are the pixels that are scored. The mask has shape
-        (ny, nx).
-        """
-        return super().usable
-
-    @cached_property
-    def sample(self) -> np.ndarray:
+    def sample(self) -> Array:
         """Return the flat indices of the n pixels that are used for fits and screening. These pixels are a
         part of the measured pixels, without the pixels near the edge of the scan.
         """
@@ -130,36 +124,36 @@ class PreparedScan(PrintedScan):
         )
 
     @cached_property
-    def _inner(self) -> np.ndarray:
+    def _inner(self) -> Array:
         ny, nx = self.shape
         border = sample_border_px(min(ny, nx))
         return np.pad(self.usable[border : ny - border, border : nx - border], border)
 
-    def at_sample(self, field_map: np.ndarray) -> np.ndarray:
+    def at_sample(self, field_map: Array) -> Array:
         """Return the values of a map of shape (ny, nx) at the sampled pixels, as float64. The result has
         shape (n,).
         """
         return field_map.reshape(-1)[self.sample].astype(np.float64)
 
-    def residual(self, prediction_um: np.ndarray) -> np.ndarray:
+    def residual(self, prediction_um: Array) -> Array:
         """Return the measured minus the predicted height at the n sampled pixels, µm, float64, of shape (n,).
         ``prediction_um`` is the predicted height, µm, of shape (ny, nx).
         """
         return self.at_sample(self.height_um) - self.at_sample(prediction_um)
 
-    def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
+    def terms_at_sample(self, prediction_um: Array, terms: Terms) -> FloatMap:
         """Return the smooth maps of the named scan terms at the sampled pixels, for the given predicted
         height. The result has shape (k, n).
         """
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
 
-    def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
+    def free_basis(self, prediction_um: Array, terms: Terms) -> Array:
         """Return an orthonormal basis of the named scan terms at the sampled pixels. The terms are computed
         from a predicted height, µm, of shape (ny, nx). The result has shape (n, k).
         """
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
-    def freed(self, values: np.ndarray, prediction_um: np.ndarray) -> np.ndarray:
+    def freed(self, values: Array, prediction_um: Array) -> Array:
         """Subtract from values at the n sampled pixels the part that the free terms can explain.
 
         Args:

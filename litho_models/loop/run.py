@@ -27,7 +27,6 @@ from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, error_rows, nested_errors
 from litho_models.loop.fits import Study
 from litho_models.loop.marks import rounding
-from litho_models.loop.model import FoldedBase
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ScanFinding
 from litho_models.loop.report import write_report
@@ -181,8 +180,7 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     """Save the corrected model as a frozen model, i.e. with fixed parameters. If the strength of an effect
     differs by group, it is fixed at its value for the group that contains the latest scan.
     """
-    base = closed.final.twin.fitted_base
-    base = base.common if isinstance(base, FoldedBase) else base
+    base = closed.final.twin.chain().base
     assert isinstance(base, Simulator)
     latest = max(closed.study.scans, key=lambda scan: scan.order)
     values = closed.final.twin.values(latest)

@@ -168,7 +168,7 @@ def test_training_fits_no_terms_to_films_unless_asked(tmp_path: Path) -> None:
     base = bases_for("features", Study.dealt(scans, 2), cache=tmp_path)["features"]
     assert isinstance(base, FoldedBase)
     free = fit("features", scans, TrainingConfig.of_recipe("fast", "features", nuisance="none")).model
-    assert torch.equal(base.common.weights, free.weights)
+    assert torch.equal(base.models[-1].weights, free.weights)
 
 
 def test_a_benchmark_of_films_is_led_by_their_edges(tmp_path: Path) -> None:
