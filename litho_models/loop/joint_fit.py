@@ -12,6 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from litho_data.foundation import Array
+
 # An effect can be tested only if at least this fraction of the squared norm of its column remains after the
 # terms of each scan and the changes that the parameters of the model can make have been projected out.
 # Strengths whose columns retain less are shrunk.
@@ -30,10 +32,10 @@ class JointFit:
         own: the number p of parameters of the model.
     """
 
-    grams: np.ndarray
+    grams: Array
     own: int
 
-    def strengths(self) -> np.ndarray:
+    def strengths(self) -> Array:
         """Return the strengths that fit the residual best if the parameters of the model are fitted, too, of
         shape (…, groups, m).
         """
@@ -43,17 +45,16 @@ class JointFit:
         parameters = _inverse(left[..., 1:, 1:]) @ left[..., 1:, :1]
         return _KEPT * (mixed[..., :1] - mixed[..., 1:] @ parameters[..., None, :, :])[..., 0]
 
-    def only(self, present: np.ndarray) -> JointFit:
+    def only(self, present: Array) -> JointFit:
         """Return the joint fit in which the strengths of some groups are 0.
 
         Args:
             present: mask of the groups whose strengths are fitted, of shape (…, groups).
         """
-        kept = np.ones((*present.shape, self.grams.shape[-1]))
-        kept[..., 1 + self.own :] = present[..., None]
+        kept = present[..., None] | (np.arange(self.grams.shape[-1]) <= self.own)
         return JointFit(self.grams * kept[..., :, None] * kept[..., None, :], self.own)
 
-    def rest(self, strengths: np.ndarray) -> np.ndarray:
+    def rest(self, strengths: Array) -> Array:
         """Return what remains of the residual at given strengths and the best parameters, as a combination of
         the residual and the columns, of shape (…, groups, 1 + p + m).
 
@@ -68,7 +69,7 @@ class JointFit:
         return np.concatenate([one, -parameters[..., None, :, 0] * one, -strengths], axis=-1)
 
     @cached_property
-    def _inverse_of_parameters(self) -> np.ndarray:
+    def _inverse_of_parameters(self) -> Array:
         """Return the inverse of the inner products of the parameters' columns over all groups, of shape (…,
         p, p).
         """
@@ -76,11 +77,11 @@ class JointFit:
         return _inverse(self.grams[..., own, own].sum(axis=-3))
 
     @property
-    def of_columns(self) -> np.ndarray:
+    def of_columns(self) -> Array:
         """Return the inner products of the effect's columns in each group, of shape (…, groups, m, m)."""
         return self.grams[..., 1 + self.own :, 1 + self.own :]
 
-    def beside_parameters(self) -> np.ndarray:
+    def beside_parameters(self) -> Array:
         """Return the inner products of the columns of the effect in each group after the changes that the
         parameters of the model can make have been projected out. The result has the shape of ``of_columns``.
         """
@@ -90,7 +91,7 @@ class JointFit:
         return self.of_columns - np.swapaxes(rows[..., cut:], -1, -2) @ fitted
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
+def _inverse(matrix: Array) -> Array:
     """Return the pseudo-inverse of symmetric matrices, of shape (…, n, n)."""
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 1e-300))
     scales = scale[..., :, None] * scale[..., None, :]

@@ -8,25 +8,22 @@ strengths of the effect, are either the same in all scans or differ by group. Th
 inner products of the residual and the columns of each scan.
 """
 
-from __future__ import annotations
-
-from collections import ChainMap, Counter
+from collections import ChainMap, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import count
 
 import numpy as np
-from numpy.typing import NDArray
 
-from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation import NM_PER_UM, Array
 from litho_models.effects import Effect
 from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import gram
 from litho_models.loop.fits import State
 from litho_models.loop.joint_fit import SMALLEST_RETAINED, JointFit
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
-from litho_models.loop.model import Twin
+from litho_models.loop.model import Twin, Values
 from litho_models.loop.prepared import ALL_FREE, PreparedScan
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import sign_flips
@@ -56,35 +53,35 @@ class Trial:
     columns: list[int]
 
     @cached_property
-    def _facts(self) -> np.ndarray:
+    def _facts(self) -> Array:
         """Return four numbers for each amplitude: its null value, its lowest value, its highest value, and
         its usual distance from the null value. The result has shape (4, amplitudes).
         """
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
-    def _distances(self, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
+    def _distances(self, sets: Sequence[Mapping[str, float]]) -> Array:
         """Return the signed distance (step) of each amplitude from its null value in each parameter set. The
         result has shape (sets, amplitudes).
         """
-        nulls = {name: self.effect.parameters[name].null for name in self.effect.amplitudes}
-        return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
+        values = [self.effect.with_values(one) for one in sets]
+        return np.array([[own[name] for name in self.effect.amplitudes] for own in values]) - self._facts[0]
 
-    def steps(self, multiples: np.ndarray) -> np.ndarray:
+    def steps(self, multiples: Array) -> Array:
         """Return the signed distance (step) of each amplitude from its null value, after each parameter set
         has been multiplied by its factor in ``multiples``. ``multiples`` has shape (…, sets), and the result
         has shape (…, amplitudes).
         """
         return multiples @ self._distances(self.sets)
 
-    def _room(self, steps: np.ndarray) -> np.ndarray:
+    def _room(self, steps: Array) -> Array:
         """Return the largest allowed step of each amplitude in the direction of the given step. It is zero if
         this direction leads to the wrong side of the null value.
         """
         null, lower, upper, _ = self._facts
         return np.where(steps > 0, upper, lower) - null
 
-    def allowed(self, multiples: np.ndarray) -> np.ndarray:
+    def allowed(self, multiples: Array) -> Array:
         """Return for each row of ``multiples``, of shape (…, sets), whether every amplitude lies on the
         allowed side of its null value after each parameter set has been multiplied by its factor.
 
@@ -96,7 +93,7 @@ class Trial:
         large = sizes > 0.3 * sizes.max(axis=-1, keepdims=True)
         return ~(large & (self._room(steps) == 0)).any(axis=-1)
 
-    def strengths(self, fit: JointFit) -> np.ndarray:
+    def strengths(self, fit: JointFit) -> Array:
         """Return the strengths of the joint fit, of shape (…, groups, sets). If the strengths of a group are
         not allowed, the effect is absent from this group: its strengths are 0, and all others are fitted
         again.
@@ -107,7 +104,7 @@ class Trial:
             found = fit.strengths()
         return found
 
-    def reach(self, multiples: np.ndarray) -> np.ndarray:
+    def reach(self, multiples: Array) -> Array:
         """For each row of ``multiples``, return the largest factor, at most 1, by which the steps of all
         amplitudes can be multiplied so that the amplitudes stay within their ranges.
 
@@ -117,7 +114,7 @@ class Trial:
         room = self._room(steps)
         return np.divide(room, steps, out=np.ones_like(steps), where=room * steps > 0).min(axis=-1, initial=1)
 
-    def start(self, multiples: np.ndarray) -> dict[str, float]:
+    def start(self, multiples: Array) -> dict[str, float]:
         """Return the parameter values from which a fit starts. No amplitude is farther from its null value
         than in the parameter sets that screening tries.
         """
@@ -139,13 +136,12 @@ def trials_of(effects: Sequence[Effect], first: int) -> list[Trial]:
     found: list[Trial] = []
     numbers = count(first)
     for effect in effects:
-        sizes: Counter[object] = Counter()
-        together: dict[object, list[Mapping[str, float]]] = {}
+        # Numbers the sizes at which the same amplitudes are tried.
+        sizes: defaultdict[object, count[int]] = defaultdict(count)
+        together: defaultdict[object, list[Mapping[str, float]]] = defaultdict(list)
         for trial in effect.trials:
             shape = frozenset((k, v) for k, v in trial.items() if k not in effect.amplitudes)
-            alike = shape, frozenset(trial)
-            together.setdefault((shape, sizes[alike]), []).append(trial)
-            sizes[alike] += 1
+            together[shape, next(sizes[shape, frozenset(trial)])].append(trial)
         found += [Trial(effect, tuple(own), [next(numbers) for _ in own]) for own in together.values()]
     return found
 
@@ -164,18 +160,19 @@ class Secants:
         self.free_terms = window.free_basis(height_um, ALL_FREE)
 
         @cache
-        def change_um(name: str, values: tuple[tuple[str, float], ...]) -> NDArray[np.float32]:
+        def change_um(name: str, values: tuple[tuple[str, float], ...]) -> Array:
             moved = twin.height(window, {name: dict(values)}, ChainMap({}, fields))
             return window.at_sample(moved - height_um).astype(np.float32)
 
         self._change_um = change_um
 
-    def of(self, trials: Sequence[Trial]) -> list[NDArray[np.float32]]:
-        """Return the changes that the parameter sets of all trials make to the prediction. Each change is an
-        array of shape (n,), µm.
+    def of(self, trials: Sequence[Trial]) -> list[Array]:
+        """Return the changes that the parameter sets of all trials make to the prediction. Each change is a
+        float32 array of shape (n,), µm.
         """
-        pairs = ((trial.effect.name, own) for trial in trials for own in trial.sets)
-        return [self._change_um(name, tuple(own.items())) for name, own in pairs]
+        return [
+            self._change_um(trial.effect.name, tuple(own.items())) for trial in trials for own in trial.sets
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +204,8 @@ class Screened:
 
     trial: Trial
     by: str
-    gains_nm2: np.ndarray
-    multiples: Mapping[str, np.ndarray]
+    gains_nm2: Array
+    multiples: Mapping[str, Array]
     allowed: bool
     retained: float
     beside_base: float
@@ -229,7 +226,7 @@ class Screened:
             facts.kind == "shape" for facts in self.trial.effect.parameters.values()
         )
 
-    def start(self) -> dict[str, dict[str, float]]:
+    def start(self) -> Values:
         """Return the parameter values from which a fit starts, keyed by group label."""
         return {label: self.trial.start(own) for label, own in self.multiples.items()}
 
@@ -270,10 +267,9 @@ class Screening:
     def candidates(self) -> list[Screened]:
         """Return the best trial of each effect for each grouping."""
         best: dict[tuple[str, str], Screened] = {}
-        for one in (own for trial in self.trials for own in self.screened(trial).values()):
-            other = best.setdefault((one.name, one.by), one)
-            if (one.allowed, one.gain_nm2) > (other.allowed, other.gain_nm2):
-                best[one.name, one.by] = one
+        for one in (own for trial in self.trials for own in self.screened(trial)):
+            key = one.name, one.by
+            best[key] = max(best.get(key, one), one, key=lambda own: (own.allowed, own.gain_nm2))
         found = best.values()
         common = np.array([one.gains_nm2 for one in found if one.by == ALL]).T
         largest = (sign_flips(len(common), self.study.seed) @ common).max(axis=1) if found else common
@@ -289,10 +285,8 @@ class Screening:
         """
         return {one.name: one for one in self.candidates if one.by == ALL}
 
-    def screened(self, trial: Trial) -> dict[str, Screened]:
-        """Screen one trial with each grouping of the scans, without the p values. The result is keyed by the
-        name of the grouping.
-        """
+    def screened(self, trial: Trial) -> list[Screened]:
+        """Screen one trial with each grouping of the scans, without the p values."""
         members = _members(self._numbers)
         fit = _joint_fit(self._products(trial), trial, members)
         strengths, gains_nm2 = trial.strengths(fit), self._gains(self._numbers, trial)
@@ -301,20 +295,19 @@ class Screening:
             (np.einsum("...ii->...i", own) / raw).max(axis=(1, 2)).tolist()
             for own in (fit.of_columns, fit.beside_parameters())
         )
-        found = {}
-        for at, (by, labels) in enumerate(self.study.groups.items()):
-            names = sorted(set(labels))
-            fitted = strengths[at, : len(names)]
-            found[by] = Screened(
+        return [
+            Screened(
                 trial=trial,
                 by=by,
                 gains_nm2=gains_nm2[at],
-                multiples=dict(zip(names, fitted, strict=True)),
-                allowed=bool(fitted.any()),
+                # A grouping with fewer groups than another has strengths of 0 for the groups that it lacks.
+                multiples=dict(zip(sorted(set(labels)), strengths[at], strict=False)),
+                allowed=bool(strengths[at].any()),
                 retained=beside[at],
                 beside_base=alone[at],
             )
-        return found
+            for at, (by, labels) in enumerate(self.study.groups.items())
+        ]
 
     def standing(self) -> list[Screened]:
         """Return the significant candidates, in order of decreasing gain. Each candidate has its best
@@ -349,7 +342,7 @@ class Screening:
         (inner,) = JointFit(summed[None], self._own).beside_parameters()
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
-    def _products(self, trial: Trial) -> np.ndarray:
+    def _products(self, trial: Trial) -> Array:
         """Return the inner products of the residual, the model's own parameters and the columns of a trial in
         each scan. If the effect is in the model, its amplitudes are not counted as parameters of the model.
         """
@@ -357,7 +350,7 @@ class Screening:
         at = np.array([*own, *trial.columns])
         return self._grams[:, at[:, None], at]
 
-    def _gains(self, groupings: np.ndarray, trial: Trial) -> np.ndarray:
+    def _gains(self, groupings: Array, trial: Trial) -> Array:
         """Return the gain of a trial on each scan, nm², of shape (groupings, scans). The strengths of its
         columns differ by group. They are fitted together with the model's own parameters, without the fold of
         the scan, and reduced so that the amplitudes stay within their ranges.
@@ -367,8 +360,7 @@ class Screening:
             trial: the trial.
         """
         products, fold_of = self._products(trial), self.study.fold_of
-        outside = np.arange(fold_of.max() + 1)[:, None] != fold_of
-        fit = _joint_fit(products, trial, _members(groupings)[:, None] & outside[:, None])
+        fit = _joint_fit(products, trial, _members(groupings)[:, None] & ~_members(fold_of)[:, None])
         found = trial.strengths(fit)
         if trial.sets:
             found *= trial.reach(found)[..., None]
@@ -416,12 +408,12 @@ class Screening:
         return replace(best, group_p=p) if p <= EXCHANGED_P else None
 
 
-def _alike(numbers: np.ndarray) -> np.ndarray:
+def _alike(numbers: Array) -> Array:
     """Return the mask of the pairs of scans in the same group, of shape (…, scans, scans)."""
     return numbers[..., :, None] == numbers[..., None, :]
 
 
-def _joint_fit(products: np.ndarray, trial: Trial, members: np.ndarray) -> JointFit:
+def _joint_fit(products: Array, trial: Trial, members: Array) -> JointFit:
     """Return the joint fit of a trial and the model's own parameters to groups of scans.
 
     Args:
@@ -432,6 +424,6 @@ def _joint_fit(products: np.ndarray, trial: Trial, members: np.ndarray) -> Joint
     return JointFit(np.tensordot(members, products, 1), products.shape[-1] - 1 - len(trial.columns))
 
 
-def _members(numbers: np.ndarray) -> np.ndarray:
+def _members(numbers: Array) -> Array:
     """Return the mask of the scans in each group, of shape (…, groups, scans)."""
     return numbers[..., None, :] == np.arange(numbers.max() + 1)[:, None]

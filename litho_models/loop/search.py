@@ -187,7 +187,7 @@ def _regroup(found: Found, number: int) -> None:
     at = [twin.own + twin.slots.index(Slot(effect.name, name)) for name in effect.amplitudes]
     trial = Trial(effect, (), [1 + one for one in at])
     screening = Screening(found.state, ())
-    best = screening.best_grouping([one for by, one in screening.screened(trial).items() if by != ALL])
+    best = screening.best_grouping([one for one in screening.screened(trial) if one.by != ALL])
     if not best:
         return
     starts, room = {}, [limits[at] for limits in twin.room()]
