@@ -37,6 +37,9 @@ from litho_models.splits.folds import grouped_folds
 
 RULES = Rules("squares", steps=24, tries=8, kept_above=0.8)
 
+# A function that receives the progress messages.
+Report = Callable[[str], None]
+
 
 def _silent(message: str) -> None:
     pass
@@ -59,7 +62,7 @@ class Study:
     fold_of: Array
     seed: int = 0
     workers: Workers = HERE
-    report: Callable[[str], None] = _silent
+    report: Report = _silent
 
     @classmethod
     def dealt(
@@ -68,7 +71,7 @@ class Study:
         folds: int,
         seed: int = 0,
         workers: Workers = HERE,
-        report: Callable[[str], None] = _silent,
+        report: Report = _silent,
     ) -> Study:
         """Prepare scans and divide them into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]

@@ -84,7 +84,7 @@ class Learner:
     """
 
     def __init__(self, study: Study, predictions: Sequence[Array]):
-        self._study = study
+        self._fold_of = study.fold_of
         # These are the layout features that the models of the zoo use for such scans.
         model = Features(RandomFeaturesConfig.of_variant(**common_geometry(study.scans)))
         pixels = sum(len(scan.sample) for scan in study.scans)
@@ -94,13 +94,14 @@ class Learner:
         # different values of it.
         facts = np.array([(scan.context.order, scan.context.dose - 1.0) for scan in study.scans])
         varied = facts[:, [len(np.unique(own)) >= 3 for own in facts.T]]
-        # For each scan: its features, the orthonormal basis of its free terms, and the inner products of the
-        # features without the free terms.
+        # For each scan: its features, the orthonormal basis of its free terms, the inner products of the
+        # features without the free terms, and the scan itself.
         self._parts = []
         for scan, own, values in zip(study.scans, predictions, varied, strict=True):
             rows = self._rows(model, scan, values)
             basis = orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
-            self._parts.append((rows, basis, gram(rows.T.astype(np.float64), basis) / len(basis)))
+            inner = gram(rows.T.astype(np.float64), basis) / len(basis)
+            self._parts.append((rows, basis, inner, scan))
 
     def rest(self, predictions: Sequence[Array]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
@@ -111,7 +112,7 @@ class Learner:
                 without the fold of this scan.
         """
         products = []
-        for scan, own, (rows, basis, inner) in zip(self._study.scans, predictions, self._parts, strict=True):
+        for own, (rows, basis, inner, scan) in zip(predictions, self._parts, strict=True):
             residual = scan.residual(own)[:: self._every]
             residual -= basis @ (basis.T @ residual)
             whole = np.pad(inner, [(1, 0), (1, 0)])
@@ -119,7 +120,7 @@ class Learner:
             whole[0, 1:] = whole[1:, 0] = rows @ residual / len(residual)
             products.append(whole)
         grams = np.stack(products)
-        left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
+        left = _held_out(grams, self._fold_of) * NM_PER_UM**2
         squares = grams[:, 0, 0] * NM_PER_UM**2
         return Rest(squares - left, squares)
 

@@ -34,6 +34,9 @@ from litho_models.loop.search import Cause, separating
 from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator
 
+# The values of the parameters of one effect, keyed by the name of the parameter.
+Strengths = dict[str, list[Strength]]
+
 
 def record(
     closed: Closed,
@@ -106,9 +109,7 @@ def _values(twin: Twin) -> dict[str, float]:
     return {name: value.item() for name, value in known.items()}
 
 
-def _found(
-    closed: Closed, cause: Cause, strengths: dict[str, list[Strength]], left_out_nm: float
-) -> FoundEffect:
+def _found(closed: Closed, cause: Cause, strengths: Strengths, left_out_nm: float) -> FoundEffect:
     effect, judgement, names = get_effect(cause.name), cause.judgement, [cause.name, *cause.alike]
     role, *others = {get_effect(name).role for name in names}
     knowledge = effect.knowledge
@@ -141,7 +142,7 @@ def _found(
     )
 
 
-def _strengths(closed: Closed) -> dict[str, dict[str, list[Strength]]]:
+def _strengths(closed: Closed) -> dict[str, Strengths]:
     """Return the values of the parameters of all effects, keyed by the name of the effect and by the name of
     the parameter. The confidence intervals of fitted values are computed from the scatter over prints. If
     there are too few prints, or if a strength applies to only one print, the scatter over scans is used
@@ -152,7 +153,7 @@ def _strengths(closed: Closed) -> dict[str, dict[str, list[Strength]]]:
     for units in (independent(scans), [scan.id for scan in scans]):
         variances = np.diag(clustered_covariance(closed.final.linear, units))[twin.own :].tolist()
         kinds.append((units, dict(zip(twin.slots, variances, strict=True))))
-    found: dict[str, dict[str, list[Strength]]] = {name: {} for name in twin.names}
+    found: dict[str, Strengths] = {name: {} for name in twin.names}
     for slot, value in twin.effects.items():
         own, ci95 = [*map(slot.is_of, scans)], None
         # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single unit

@@ -20,12 +20,12 @@ from litho_models.effects import get_effect
 from litho_models.fitting.base_models import AUTO
 from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
-from litho_models.frozen.card import OUT_OF_FOLD
+from litho_models.frozen.card import OUT_OF_FOLD, EffectValues
 from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, Parts, error_rows, nested_errors
-from litho_models.loop.fits import Study
+from litho_models.loop.fits import Report, Study
 from litho_models.loop.marks import rounding
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ScanFinding
@@ -59,7 +59,7 @@ def close_loop(
     further: Further | None = None,
     decided_by: Sequence[str] = (),
     left_out: Sequence[str] = (),
-    report: Callable[[str], None] = lambda message: None,
+    report: Report = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store: find the effects that a base model lacks, and write the corrected
     model and the record to the folder ``out``. This folder appears only when the result is complete.
@@ -186,7 +186,7 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     values = closed.final.twin.values(latest)
     sides = {"process": "printer", "measurement": "microscope"}
 
-    def on(*roles: str) -> dict[str, dict[str, float]]:
+    def on(*roles: str) -> EffectValues:
         return {one.name: values[one.name] for one in result.effects if one.role in roles}
 
     error = result.error("all")
