@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -147,6 +147,9 @@ class State:
     linear: list[Linearised]
     held_out_um: list[Array]
     freed_um: list[Array]
+    # Cache of models without one of the effects, keyed by the name of this effect. Several steps of the loop
+    # need the same model.
+    _without: dict[str, State] = field(default_factory=dict, init=False)
 
     @cached_property
     def freed_nm2(self) -> Array:
@@ -161,12 +164,11 @@ class State:
         """Leave out the study with its scans when a state is sent to another process."""
         return {**self.__dict__, "study": None}
 
-    @cached_property
-    def without(self) -> Callable[[str], State]:
-        """Return a function that returns the model without the named effect, refitted from the current
-        parameters. Several steps of the loop need the same model, so the function keeps its results.
-        """
-        return cache(lambda name: fit_state(self.twin.without(name), self.study, from_here=True))
+    def without(self, name: str) -> State:
+        """Return the model without the named effect, refitted from the current parameters."""
+        if name not in self._without:
+            self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
+        return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[Array]:
         """Predict the height of the print in each scan (or window), µm, of shape (ny, nx). Each prediction is
