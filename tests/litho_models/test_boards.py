@@ -25,7 +25,7 @@ DRAWS = [
 EXAMPLE = f"{sys.executable} {Path(__file__).parents[2] / 'examples' / 'plain_loop.py'}"
 
 
-def at_half_its_limit(draw: Draw, jobs: object) -> list[Planted]:
+def at_half_its_limit(draw: Draw, jobs: object, base: str) -> list[Planted]:
     """Plant every cause at half its largest strength, without a search for the strength."""
     return [
         Planted(draw=one, names=[*names_of(one.name)], strength=0.5, unit="1", at_limit=False, rms_nm=40.0)
