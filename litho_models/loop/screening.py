@@ -42,10 +42,6 @@ class Trial:
     which multiplies the change that the set makes.
 
     There is one column of the regression for each set. ``columns`` contains the numbers of the columns.
-
-    A trial without sets stands for an effect that the model already contains. There is then one column for
-    each amplitude: the derivative of the prediction with respect to this amplitude. The factor of a column is
-    the change of the amplitude, and it is not limited.
     """
 
     effect: Effect
@@ -99,7 +95,7 @@ class Trial:
         again.
         """
         found = fit.strengths()
-        while self.sets and not (present := self.allowed(found)).all():
+        while not (present := self.allowed(found)).all():
             fit = fit.only(present)
             found = fit.strengths()
         return found
@@ -344,10 +340,9 @@ class Screening:
 
     def _products(self, trial: Trial) -> Array:
         """Return the inner products of the residual, the model's own parameters and the columns of a trial in
-        each scan. If the effect is in the model, its amplitudes are not counted as parameters of the model.
+        each scan.
         """
-        own = [at for at in range(1 + self._own) if at not in trial.columns]
-        at = np.array([*own, *trial.columns])
+        at = np.r_[: 1 + self._own, trial.columns]
         return self._grams[:, at[:, None], at]
 
     def _gains(self, groupings: Array, trial: Trial) -> Array:
@@ -362,8 +357,7 @@ class Screening:
         products, fold_of = self._products(trial), self.study.fold_of
         fit = _joint_fit(products, trial, _members(groupings)[:, None] & ~_members(fold_of)[:, None])
         found = trial.strengths(fit)
-        if trial.sets:
-            found *= trial.reach(found)[..., None]
+        found *= trial.reach(found)[..., None]
         at = np.arange(len(groupings))[:, None], fold_of, groupings
         before, after = (
             np.einsum("gsi,sij,gsj->gs", rest, products, rest, optimize=True)

@@ -18,9 +18,9 @@ from litho_data.sharing.workers import run_jobs
 from litho_models.effects import Effect, get_effect, screened_effects
 from litho_models.effects.effect import Role
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import GROUPED_P, Judgement, judge, judge_states, told_apart
-from litho_models.loop.model import Slot, Twin, Values
-from litho_models.loop.screening import Screened, Screening, Secants, Trial
+from litho_models.loop.judging import Judgement, judge, judge_states, told_apart
+from litho_models.loop.model import Twin, Values
+from litho_models.loop.screening import Screened, Screening, Secants
 from litho_models.scan_terms.grouped import ALL
 
 # Two effects count as indistinguishable if the cosine between the changes that they make to the predictions
@@ -116,7 +116,8 @@ def search(
     _test_again(found)
     while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
-    _defend(found)
+    if len(found.causes) > 1:
+        _test_again(found)
     return found
 
 
@@ -164,43 +165,10 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secan
             found.causes.append(Cause(one.name, one.by, alike, judgement, one.family_p, one.group_p))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
-            _regroup(found, -1)
             gained = f"{judgement.gain_nm2:.0f} of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: it removes {gained}")
             return True
     return False
-
-
-def _regroup(found: Found, number: int) -> None:
-    """Let the strength of a cause differ by group if held-out scans confirm that it does.
-
-    Screening has already tried strengths that differ by group. This second test is more reliable, because it
-    uses the derivative of the prediction at the fitted strength of the cause.
-
-    Args:
-        number: index of the cause in ``found.causes``.
-    """
-    cause, twin, study = found.causes[number], found.state.twin, found.state.study
-    if cause.by != ALL:
-        return
-    effect = get_effect(cause.name)
-    at = [twin.own + twin.slots.index(Slot(effect.name, name)) for name in effect.amplitudes]
-    trial = Trial(effect, (), [1 + one for one in at])
-    screening = Screening(found.state, ())
-    best = screening.best_grouping([one for one in screening.screened(trial) if one.by != ALL])
-    if not best:
-        return
-    starts, room = {}, [limits[at] for limits in twin.room()]
-    for label, steps in best.multiples.items():
-        vector = twin.vector.copy()
-        vector[at] += np.clip(steps, *room)
-        starts[label] = twin.at(vector).values()[effect.name]
-    twin = twin.without(effect.name).with_effect(effect.name, best.by, starts)
-    state = fit_state(twin, study, from_here=True)
-    if judge_states(found.state, state).p <= GROUPED_P:
-        study.report(f"the strength of {effect.name} differs by {best.by}")
-        found.causes[number] = replace(cause, by=best.by, group_p=best.group_p)
-        found.state = state
 
 
 def _alike(
@@ -254,16 +222,6 @@ def same_change(before: State, one: State, other: State) -> bool:
 
     a, b = change(one), change(other)
     return bool(a @ b > SAME_COSINE * np.linalg.norm(a) * np.linalg.norm(b))
-
-
-def _defend(found: Found) -> None:
-    """Test again for each cause whether its strength differs by group, because such a difference may become
-    visible only when the other causes are in the model. Then test each cause again.
-    """
-    if len(found.causes) > 1:
-        for number in range(len(found.causes)):
-            _regroup(found, number)
-        _test_again(found)
 
 
 def _test_again(found: Found) -> None:

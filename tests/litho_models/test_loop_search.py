@@ -14,9 +14,7 @@ from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import CONFIRM_P, FEWEST_SCANS, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
 from litho_models.loop.search import (
-    Cause,
     Found,
-    _defend,
     describe,
     same_change,
     search,
@@ -83,21 +81,6 @@ def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool, in_all_s
     assert added(found) == {name: ALL for name, *_ in lacking}
     if not needed:
         assert found.refused[THINNING]
-
-
-def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end() -> None:
-    """Check a grouping that shows only if another cause is included. It belongs to a cause that was not added
-    last.
-    """
-    values = {"1": thinning(0.1), "2": thinning(0.2)}
-    study = study_of(planted([(THINNING, "field", values), (MEMORY, ALL, {"": memory(0.3)})]))
-    twin = bare_state(study).twin.with_effect(THINNING, ALL, {"": thinning(0.15)})
-    state = fit_state(twin.with_effect(MEMORY, ALL, {"": memory(0.3)}), study)
-    judged = judge(np.full(10, 100.0), np.full(10, 50.0), study)
-    found = Found(state, [Cause(name, ALL, (), judged, 0.01, None) for name in (THINNING, MEMORY)])
-    _defend(found)
-    assert added(found) == {THINNING: "field", MEMORY: ALL}
-    assert found.state.twin.values(study.scans[1])[THINNING]["along_x_um"] == pytest.approx(0.2, rel=0.1)
 
 
 def test_a_cause_in_all_scans_is_found_with_one_strength(in_all_scans: Found) -> None:
