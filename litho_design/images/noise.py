@@ -17,8 +17,8 @@ T = TypeVar("T")
 
 # Number of random draws of the noise. With this number of draws, the rms change of a score is known to 25 %.
 DRAWS = 8
-# Number of tiles along each side of a map from which the covariance of a fit is computed. An error of the
-# expected map extends over several features, so a tile must contain many features.
+# Number of tiles along each side of a map from which the covariance of a fit is computed. Errors of
+# the expected map extend over several features, so each tile must contain many features.
 _TILES = 4
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35

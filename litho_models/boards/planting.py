@@ -1,9 +1,9 @@
 """Find the strengths of the causes of a trial, and simulate its prints and scans with these causes.
 
-The size of a cause is the rms residual after the best base model has been refitted to prints with this cause.
-To measure this size, each base model that the loop may choose is fitted to noise-free scans that contain the
-cause. (Without causes, the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an
-affine registration error are fitted to each scan at the same time.
+The size of a cause is the rms residual that remains if the base model is refitted to prints with this cause.
+To measure it, each base model that the loop may choose is fitted to noise-free scans that contain the cause,
+and the smallest residual counts. (Without causes, the Physics model represents the virtual fab exactly.)
+Datum, gain, tilt, bow and an affine registration error are fitted to each scan at the same time.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,6 @@ from litho_models.boards.records import CauseDraw, Draw, Planted
 from litho_models.fitting.base_models import base_models
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
 from litho_models.fitting.small_models import ModelProblem, fitted_numbers
-from litho_models.models import build_model
 from litho_models.scan_terms import POLICIES
 from litho_models.simulator import Simulator
 
@@ -39,8 +39,8 @@ _RULES = Rules("squares", relative_gain=5e-3)
 # scans, with all base models.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
-# A refit of the base model leaves 5 to 7 % of the change that a moderate blur makes, and at least 23 % of the
-# change that any other knob makes. If it leaves less than this share, the base model imitates the knob.
+# The Physics model imitates a knob if a refit leaves less than this share of the change that the knob makes.
+# A refit leaves 5 to 7 % of a moderate blur, and at least 23 % of any other knob.
 _IMITATED = 0.12
 
 
@@ -150,7 +150,7 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
 
 
 def refitted_rms_nm(
-    heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer, base: str = ""
+    heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer, further: str = ""
 ) -> float:
     """Fit models and the per-scan terms to noise-free scans. Return the rms residual of the model that fits
     best, nm.
@@ -158,12 +158,12 @@ def refitted_rms_nm(
     Args:
         heights_um: one array of shape (ny, nx) per job: heights on the grid of the layout, µm.
         printer: printer whose parameters are used as starting values of the Physics model.
-        base: name of a further model, or ``auto`` for several. If it is empty, only the Physics model is
+        further: name of a further model, or ``auto`` for several. If it is empty, only the Physics model is
             fitted.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
-    further = base_models(base, scans[0]).values() if base else ()
-    return min(_rms_nm(model, scans) for model in (plain_model(printer), *further))
+    models = base_models(further, _geometry(printer)).values() if further else ()
+    return min(_rms_nm(model, scans) for model in (plain_model(printer), *models))
 
 
 def _rms_nm(model: Simulator, scans: Sequence[PrintedScan]) -> float:
@@ -188,20 +188,24 @@ def plain_model(printer: Printer) -> Simulator:
     """Return the Physics model with the values that reproduce the virtual fab without causes. As in the loop,
     the width of its spot is one of the fitted parameters.
     """
-    return build_model(
-        "physics",
-        pitch_um=printer.pitch_um,
-        level_height_um=printer.level_height_um,
-        levels=printer.levels,
-        sigma_optical_um=printer.spot_sigma_um / 2**0.5,
+    fields = {
+        "sigma_optical_um": printer.spot_sigma_um / 2**0.5,
         # A normalised logistic of steepness s is a normalised tanh of steepness s/2.
-        alpha_init=printer.threshold_steepness / 2,
-        eta_init=printer.threshold_dose,
-        kappa_min_init=printer.loose_retention,
-        sigma_diffusion_init_um=printer.network_reach_um,
-        bias_init_um=printer.base_um,
-        spot="round",
-    )
+        "alpha_init": printer.threshold_steepness / 2,
+        "eta_init": printer.threshold_dose,
+        "kappa_min_init": printer.loose_retention,
+        "sigma_diffusion_init_um": printer.network_reach_um,
+        "bias_init_um": printer.base_um,
+    }
+    return base_models("physics", _geometry(printer), fields)["physics"]
+
+
+def _geometry(printer: Printer) -> dict[str, Any]:
+    return {
+        "pitch_um": printer.pitch_um,
+        "level_height_um": printer.level_height_um,
+        "levels": printer.levels,
+    }
 
 
 def _as_scan(job: Job, height_um: np.ndarray, printer: Printer) -> PrintedScan:
@@ -212,9 +216,7 @@ def _as_scan(job: Job, height_um: np.ndarray, printer: Printer) -> PrintedScan:
         mask_level=job.level,
         height_um=height_um.astype(np.float32),
         valid=np.ones(height_um.shape, bool),
-        pitch_um=printer.pitch_um,
-        level_height_um=printer.level_height_um,
-        levels=printer.levels,
+        **_geometry(printer),
         scan_to_layout=np.eye(3),
     )
 
@@ -224,9 +226,9 @@ def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw, base: str) -> Plan
     by_share = sorted(jobs, key=lambda job: share_of(drawn, job))
     few = [by_share[i] for i in np.linspace(0, len(jobs) - 1, min(_SOUGHT_ON, len(jobs))).round().astype(int)]
 
-    def left_nm(strength: float, fields: Sequence[Job] = few, base: str = "") -> float:
+    def left_nm(strength: float, fields: Sequence[Job] = few, further: str = "") -> float:
         heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], fields)
-        return refitted_rms_nm(heights, fields, printer, base)
+        return refitted_rms_nm(heights, fields, printer, further)
 
     def change_nm(strength: float) -> float:
         return knob_rms_nm(KnobSetting(drawn.name, strength, draw.seed), jobs, printer=printer)

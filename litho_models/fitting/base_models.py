@@ -5,29 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from litho_data.store import PrintedScan
-from litho_models.fitting.fit import common_geometry
 from litho_models.models import build_model
 from litho_models.simulator import Simulator
 
 AUTO = "auto"
-# Models from which the loop chooses one if the name is ``AUTO``. The first of them has the same form as the
-# Physics model of the paper.
+# Models from which the loop chooses one if the name is ``AUTO``. They are tried in this order, so models with
+# fewer parameters come first. The first has the same form as the Physics model of the paper.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 # Settings of base models that differ from the defaults of these models.
 _USUAL = {"physics": {"spot": "round"}}
 
 
-def base_models(base: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> dict[str, Simulator]:
+def base_models(
+    base: str, geometry: Mapping[str, Any], fields: Mapping[str, Any] = {}
+) -> dict[str, Simulator]:
     """Return the model with the given name, or several small models if the name is ``AUTO``. The result is
     keyed by name.
 
     Args:
         base: name of a model, or ``AUTO``.
-        scan: any of the scans, which provides the pitch and the levels.
+        geometry: pitch, level height and number of levels of the layouts, keyed by name.
         fields: settings of the model, keyed by name.
     """
     return {
-        name: build_model(name, **common_geometry([scan]), **{**_USUAL.get(name, {}), **fields})
+        name: build_model(name, **geometry, **{**_USUAL.get(name, {}), **fields})
         for name in (_COMPETING if base == AUTO else (base,))
     }

@@ -16,6 +16,7 @@ from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan, Store
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.base_models import AUTO, base_models
+from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
@@ -61,7 +62,7 @@ def bases_for(
     scan = study.scans[0]
     bases: Mapping[str, nn.Module]
     if base == AUTO or base in MODELS:
-        bases = base_models(base, scan, {} if base == AUTO else fields)
+        bases = base_models(base, common_geometry([scan]), {} if base == AUTO else fields)
     else:
         bases = _frozen(base, scan.pitch_um, store)
     small = all(map(is_small, bases.values()))

@@ -144,19 +144,22 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     if told := estimate("the loop", _OVER_FIRST_FITS * (time.monotonic() - began_s)):
         study.report(told + ("; if it finds effects, several times as long" if freed.of_films else ""))
     rest = _rest_beside(next(iter(starts.values())))
-    ends: dict[str, tuple[Found, Found, Found]] = {}
+    results: dict[str, tuple[Found, Found, Found]] = {}
     for name, state in starts.items():
         study.report(f"searching for effects that {name} lacks")
-        # All base models probably lack the same causes, so each search starts from the causes that were found
-        # with the first base model.
-        first, *_ = next(iter(ends.values()), [Found(state)])
-        named = search(first.with_base(state), candidates)
+        named = Found(state)
+        if results:
+            # All base models probably lack the same causes, so each search starts from the causes that were
+            # found with the first base model.
+            first, _, _ = next(iter(results.values()))
+            named = first.with_base(state)
+        search(named, candidates)
         lawful, described = _checked(state, named, rest)
-        ends[name] = named, lawful, described
-        if not rest(lawful.state).matters:
+        results[name] = named, lawful, described
+        if len(results) < len(starts) and not rest(lawful.state).matters:
             break
-    chosen = _simplest(ends)
-    start, (named, lawful, described) = starts.pop(chosen), ends[chosen]
+    chosen = _simplest(results)
+    start, (named, lawful, described) = starts.pop(chosen), results[chosen]
     for name, rival in starts.items():
         named.causes = _tested_on(name, rival, lawful.state, named.causes)
     return Closed(
@@ -243,7 +246,7 @@ def freed_scans(state: State) -> list[PreparedScan]:
     return freed
 
 
-def _simplest(ends: Mapping[str, tuple[Found, Found, Found]]) -> str:
+def _simplest(results: Mapping[str, tuple[Found, Found, Found]]) -> str:
     """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
     them is chosen.
 
@@ -252,15 +255,15 @@ def _simplest(ends: Mapping[str, tuple[Found, Found, Found]]) -> str:
     of such causes, choose the model that has the fewest parameters together with its effects.
 
     Args:
-        ends: for each base model, the results of the searches for causes, laws and tables.
+        results: for each base model, the results of the searches for causes, laws and tables.
     """
-    best_nm2 = min(lawful.state.mse_nm2 for _, lawful, _ in ends.values())
+    best_nm2 = min(lawful.state.mse_nm2 for _, lawful, _ in results.values())
     close = {
         name: (
-            sum(not all(other.has(cause) for other, *_ in ends.values()) for cause in named.causes),
+            sum(not all(other.has(cause) for other, _, _ in results.values()) for cause in named.causes),
             len(lawful.state.twin.vector),
         )
-        for name, (named, lawful, _) in ends.items()
+        for name, (named, lawful, _) in results.items()
         if lawful.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
     }
     return min(close, key=close.__getitem__)
@@ -271,7 +274,8 @@ def _tested_on(name: str, rival: State, final: State, causes: list[Cause]) -> li
     held-out scans still confirm in this model.
 
     Args:
-        name, rival: the other base model, fitted without effects.
+        name: name of the other base model.
+        rival: the other base model, fitted without effects.
         final: the chosen base model with all causes and laws.
         causes: the causes.
     """

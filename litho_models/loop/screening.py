@@ -8,7 +8,7 @@ strengths of the effect, are either the same in all scans or differ by group. Th
 inner products of the residual and the columns of each scan.
 """
 
-from collections import ChainMap, defaultdict
+from collections import ChainMap, Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -132,12 +132,14 @@ def trials_of(effects: Sequence[Effect], first: int) -> list[Trial]:
     found: list[Trial] = []
     numbers = count(first)
     for effect in effects:
-        # Numbers the sizes at which the same amplitudes are tried.
-        sizes: defaultdict[object, count[int]] = defaultdict(count)
+        # How often the same amplitudes have been tried with the same shape.
+        sizes: Counter[object] = Counter()
         together: defaultdict[object, list[Mapping[str, float]]] = defaultdict(list)
         for trial in effect.trials:
             shape = frozenset((k, v) for k, v in trial.items() if k not in effect.amplitudes)
-            together[shape, next(sizes[shape, frozenset(trial)])].append(trial)
+            alike = shape, frozenset(trial)
+            together[shape, sizes[alike]].append(trial)
+            sizes[alike] += 1
         found += [Trial(effect, tuple(own), [next(numbers) for _ in own]) for own in together.values()]
     return found
 
@@ -282,7 +284,7 @@ class Screening:
         return {one.name: one for one in self.candidates if one.by == ALL}
 
     def screened(self, trial: Trial) -> list[Screened]:
-        """Screen one trial with each grouping of the scans, without the p values."""
+        """Screen one trial with each grouping of the scans. The p values are not computed."""
         members = _members(self._numbers)
         fit = _joint_fit(self._products(trial), trial, members)
         strengths, gains_nm2 = trial.strengths(fit), self._gains(self._numbers, trial)

@@ -65,9 +65,9 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
         dataset: the dataset on which the loop was closed.
         single_scans: findings of this loop about per-scan terms.
     """
-    study, stored = closed.study, closed.study.scans
-    maps = closed.final.maps_um(study.scans)
-    left = [*map(left_nm, study.scans, maps)]
+    scans = closed.study.scans
+    maps = closed.final.maps_um(scans)
+    left = [*map(left_nm, scans, maps)]
     noise = noise_spectrum(left)
     asked = [_of_cause(closed, cause, left, noise) for cause in closed.traced]
     asked.append(_of_suspects(closed, maps))
@@ -76,7 +76,7 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
         if one.seen and terms and (one.role == "undetermined" or one.confusable_with):
             sizes = {parameter: spread.value for parameter, spread in one.spread.items()}
             asked.append(_question("lines" if line_terms(terms) else "per-scan", [one.name], sizes=sizes))
-    write = stored[0].write or {}
+    write = scans[0].write or {}
     # Effects that could not be tested because a fact about the prints is missing, each with the reason.
     unplaced = "the position of the prints in the write field is not known"
     missing = dict.fromkeys(() if "field_um" in write else _OF_PLACE, unplaced) | closed.untestable
@@ -84,12 +84,12 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
     return OpenQuestions(
         dataset=dataset,
         noise=noise,
-        level_share=level_share(stored),
-        cutoff_per_um=_cutoff_per_um(stored),
+        level_share=level_share(scans),
+        cutoff_per_um=_cutoff_per_um(scans),
         write_field_um=write.get("field_um"),
-        slow_axis=study.scans[0].context.slow_axis,
+        slow_axis=scans[0].context.slow_axis,
         surround=write.get("surround"),
-        instrument=stored[0].seen_by,
+        instrument=scans[0].seen_by,
         questions=[*filter(None, asked)],
     )
 

@@ -311,7 +311,7 @@ def test_what_any_base_model_of_the_loop_can_imitate_does_not_count():
 def test_a_cause_with_weak_scans_is_sized_on_strong_scans_too():
     draw = drawn(cause("vignetting", 9.0, by="field", place="2", weak=0.0), printer={"network_reach_um": 0.3})
     (planted,) = plant(draw, trial_jobs(draw, 12, 96), "physics")
-    # Three of the twelve scans are strong, and one of the four on which the strength is searched.
+    # Three of the twelve scans are strong. The strength is searched on one of them and on three weak ones.
     # The layouts differ, so the strong scans are not changed equally.
     assert not planted.at_limit
     assert planted.rms_nm == pytest.approx(9.0, rel=0.5)
