@@ -110,6 +110,14 @@ class PrintedScan:
         return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
 
     @property
+    def exposed_um(self) -> Array:
+        """Return the exposure of each pixel, expressed as a nominal height in µm: the layout times the
+        relative dose, because a smaller dose acts like a lower layout. Models predict prints from it. The
+        array is float32 and of shape (ny, nx).
+        """
+        return self.layout_um * np.float32(self.dose or 1)
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Return the shape (ny, nx) in pixels."""
         return self.mask_level.shape[0], self.mask_level.shape[1]
@@ -117,9 +125,9 @@ class PrintedScan:
 
 def scan_sha256(scan: PrintedScan) -> str:
     """Return a hash of all attributes of a scan. It identifies the scan in caches, resumed work and dataset
-    ids.
+    ids. Attributes that a subclass adds are left out.
     """
-    return record_sha256(_hashed(scan))
+    return record_sha256({one.name: _hashed(getattr(scan, one.name)) for one in fields(PrintedScan)})
 
 
 def _hashed(value: Any) -> Any:

@@ -114,7 +114,7 @@ def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int) -> _Pixels:
     at = grid_pixels(scan, count)
     chosen = torch.from_numpy(at)
     with torch.no_grad():
-        layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], model.reach_px, model.reach_px)
+        layout = pad_field(torch.from_numpy(scan.exposed_um)[None, None], model.reach_px, model.reach_px)
         printed, fields = model.feature_fields(layout)
         seen = [
             feature.flatten()[chosen]
@@ -122,5 +122,5 @@ def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int) -> _Pixels:
             for feature in network.features(field)
         ]
     rest = scan.height_um.reshape(-1)[at].astype(np.float64) - printed.flatten()[chosen].double().numpy()
-    maps = term_maps(TermPixels(scan.layout_um, at=at), terms)
+    maps = term_maps(TermPixels(scan.exposed_um, at=at), terms)
     return _Pixels(torch.stack(seen, dim=1), rest, maps)

@@ -86,7 +86,7 @@ def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, F
     """
     at = grid_pixels(scan, FITTED_PX)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
-    return feature_rows(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
+    return feature_rows(model, scan, at), height, term_maps(TermPixels(scan.exposed_um, at=at), terms)
 
 
 def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
@@ -94,7 +94,7 @@ def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap
     computed tile by tile. The result has shape (k, n).
     """
     reach = model.reach_px
-    layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], reach, reach)
+    layout = pad_field(torch.from_numpy(scan.exposed_um)[None, None], reach, reach)
     place = np.stack(np.divmod(at, scan.shape[1]))
     tile = place // TILE_PX
     found = np.empty((model.parameter_count, len(at)))

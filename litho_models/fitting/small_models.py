@@ -104,7 +104,7 @@ class _Sample:
 
     def __init__(self, scan: PrintedScan, number: int):
         self._window = _corner(scan, number % 4)
-        self._layout_um = scan.layout_um
+        self._exposed_um = scan.exposed_um
         height = cut(scan.height_um, self._window)
         used = np.zeros(height.shape, bool)
         used[::THINNING_PX, ::THINNING_PX] = True
@@ -140,8 +140,8 @@ class _Sample:
         result has shape (ny, nx).
         """
         if model.reach_px is None:
-            return model(stack([self._layout_um], [self._window]))[0, 0]
-        return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]
+            return model(stack([self._exposed_um], [self._window]))[0, 0]
+        return model.interior(stack([self._exposed_um], [self._window], model.reach_px))[0, 0]
 
     def residual(self, height_um: Array) -> Array:
         """Return measured minus predicted heights at the fitted pixels, µm, of shape (n,)."""

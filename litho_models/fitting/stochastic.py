@@ -135,7 +135,7 @@ class _Targets:
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
-        self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
+        self.layouts_um = [np.pad(scan.exposed_um, overhang_px, mode="edge") for scan in scans]
         self.shapes = [layout.shape for layout in self.layouts_um]
         self.weights = [np.pad(scan.usable.astype(np.float32), overhang_px) for scan in scans]
         heights = [

@@ -23,7 +23,6 @@ from litho_models.frozen.files import load_simulator
 from litho_models.frozen.on_store import trained_ids
 from litho_models.loop.fits import Study
 from litho_models.loop.model import FoldedBase, is_refitted
-from litho_models.loop.prepared import exposed
 from litho_models.models import MODELS
 from litho_models.simulator import is_small
 
@@ -100,8 +99,7 @@ def _frozen(base: str, pitch_um: float, store: Store | None) -> dict[str, nn.Mod
 
 
 def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]) -> FoldedBase:
-    """Train one model for each fold on the scans outside this fold, and one model on all scans. Before the
-    training, each layout is multiplied by the dose of its scan, as for all predictions of the loop.
+    """Train one model for each fold on the scans outside this fold, and one model on all scans.
 
     Args:
         study: the scans with their folds, and the workers.
@@ -109,7 +107,7 @@ def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]
             is sent to other processes.
     """
     # The last model is trained on all scans.
-    jobs = [partial(trainer, [*map(exposed, known)]) for known in (*study.others, study.scans)]
+    jobs = [partial(trainer, known) for known in (*study.others, study.scans)]
     done = run_jobs(call, jobs, study.workers, name=lambda job: f"fold {jobs.index(job)}")
     trained = dict(progress(done, "training the base model", len(jobs)))
     fold_of = dict(zip((scan.id for scan in study.scans), study.fold_of.tolist(), strict=True))

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,36 +33,6 @@ _MARGIN_PX = 48
 # Number of pixels of each scan that are used for fits and screening. Residuals are correlated over about 5
 # px, so more pixels would add little information.
 _SAMPLED_PX = 16384
-
-
-@dataclass(frozen=True, repr=False)
-class ExposedScan(PrintedScan):
-    """A scan with its exposed layout. The exposed layout is the nominal layout times ``exposure``, the
-    relative dose of the scan.
-    """
-
-    exposure: float = 1.0
-
-    @property
-    def layout_um(self) -> Array:
-        """Return the exposed height of each pixel in µm, a float32 array of shape (ny, nx)."""
-        return super().layout_um * np.float32(self.exposure)
-
-
-def exposed(scan: PrintedScan) -> PrintedScan:
-    """Multiply the layout of a scan by its dose, because a smaller dose acts like a lower layout. The loop
-    predicts prints from the resulting layout. A scan without a dose, or with a dose of 1, is returned as it
-    is in the store, so that cached fits to this scan stay valid.
-    """
-    facts = _stored_facts(scan)
-    if scan.dose in (None, 1):
-        return PrintedScan(**facts)
-    return ExposedScan(**facts, exposure=float(scan.dose))
-
-
-def _stored_facts(scan: PrintedScan) -> dict[str, Any]:
-    """Return what the store contains about a scan, keyed by field of ``PrintedScan``."""
-    return {one.name: getattr(scan, one.name) for one in fields(PrintedScan)}
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -195,7 +164,7 @@ def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = 
     for number, (scan, order) in enumerate(zip(scans, places.tolist(), strict=True)):
         write = scan.write or {}
         context = FieldContext(
-            layout_um=torch.from_numpy(exposed(scan).layout_um)[None, None],
+            layout_um=torch.from_numpy(scan.exposed_um)[None, None],
             pitch_um=scan.pitch_um,
             full_height_um=(scan.levels - 1) * scan.level_height_um,
             slice_um=scan.level_height_um,
@@ -210,7 +179,9 @@ def prepare_scans(scans: Sequence[PrintedScan], known: Sequence[PreparedScan] = 
             dose=float(scan.dose or 1),
         )
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
-        prepared.append(PreparedScan(**_stored_facts(scan), context=context, line=line, number=number))
+        # Scans of another loop are already prepared, but for another study.
+        stored = {one.name: getattr(scan, one.name) for one in fields(PrintedScan)}
+        prepared.append(PreparedScan(**stored, context=context, line=line, number=number))
     return prepared
 
 

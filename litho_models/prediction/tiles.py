@@ -157,5 +157,5 @@ def predict_scan(model: Simulator, scan: PrintedScan) -> np.ndarray:
     """
     device = next(model.parameters(), torch.empty(0)).device
     with torch.no_grad():
-        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
+        layout = torch.from_numpy(scan.exposed_um)[None, None].to(device)
         return predict_field(model, layout)[0, 0].float().cpu().numpy()
