@@ -130,7 +130,7 @@ FAULTS = [
           "for own, held_out in study.folds:", "for own, held_out in [(list(range(len(scans))),) * 2]:",
           f"{RUN} -k others_say"),
     Fault("a choice made with the print that is judged", "litho_models/loop/errors.py",
-          "close_again([scans[i] for i in rest])", "close_again(scans)",
+          "closed = close_again(known)", "closed = close_again([*known, *left_out])",
           f"{RUN} -k judged_on"),
     # Reports.
     Fault("a coverage stands under another level", "litho_models/noise/report.py",

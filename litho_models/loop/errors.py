@@ -241,17 +241,26 @@ def nested_errors(
     """Repeat the loop for each fold (or print), with the chosen base model: run it without this fold (or
     print), and score its result on the scans that were left out. Return the errors on all scans.
     """
-    scans, folds, predicted = study.scans, parted(study, nested).folds, []
-    for number, (rest, own) in enumerate(progress(folds, "repeating all choices"), 1):
-        out = [scans[i] for i in own]
-        names = ", ".join(scan.id for scan in out)
-        study.report(f"leaving out {names} and repeating all choices ({number} of {len(folds)})")
-        closed = close_again([scans[i] for i in rest])
-        predicted.append((own, HeldOut(closed.given).of_others(closed, out)))
+    scans, parts = study.scans, parted(study, nested)
+    jobs = [
+        partial(_of_left_out, close_again, [scans[i] for i in rest], [scans[i] for i in own])
+        for rest, own in parts.folds
+    ]
+    done = run_jobs(call, jobs, study.workers, name=lambda job: f"{nested[:-1]} {jobs.index(job) + 1}")
+    predicted = dict(progress(done, "repeating all choices", len(jobs)))
     rows = []
-    for stage in predicted[0][1]:
-        maps = dict(pair for own, found in predicted for pair in zip(own, found[stage][0], strict=True))
-        numbers = max(found[stage][1] for _, found in predicted)
-        every = [maps[i] for i in range(len(scans))]
-        rows += error_rows(scans, every, numbers, study.seed, model=stage, held_out=f"nested {nested}")
+    for stage in predicted[jobs[0]]:
+        maps, numbers = zip(*(predicted[job][stage] for job in jobs), strict=True)
+        following = [*map(iter, maps)]
+        every = [next(following[at]) for at in parts.fold_of]
+        rows += error_rows(scans, every, max(numbers), study.seed, model=stage, held_out=f"nested {nested}")
     return rows
+
+
+def _of_left_out(
+    close_again: Callable[[Sequence[PrintedScan]], Closed],
+    known: Sequence[PrintedScan],
+    left_out: Sequence[PrintedScan],
+) -> dict[Stage, Predicted]:
+    closed = close_again(known)
+    return HeldOut(closed.given).of_others(closed, left_out)

@@ -41,10 +41,6 @@ RULES = Rules("squares", steps=24, tries=8, kept_above=0.8)
 Report = Callable[[str], None]
 
 
-def _silent(message: str) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class Study:
     """Scans with their folds, and the settings for judging findings.
@@ -62,7 +58,7 @@ class Study:
     fold_of: Array
     seed: int = 0
     workers: Workers = HERE
-    report: Report = _silent
+    report: Report = lambda message: None
 
     @classmethod
     def dealt(
@@ -71,19 +67,13 @@ class Study:
         folds: int,
         seed: int = 0,
         workers: Workers = HERE,
-        report: Report = _silent,
+        report: Report = lambda message: None,
     ) -> Study:
         """Prepare scans and divide them into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]
         lists = grouped_folds(ids, [field_of(scan) for scan in scans], folds, seed)
         fold_of = np.argmax([[one in members for one in ids] for members in lists], axis=0)
         return cls(prepare_scans(scans), fold_of, seed, workers, report)
-
-    def __getstate__(self) -> dict[str, object]:
-        """Leave out the workers and the function for progress messages, which cannot be sent to
-        another process.
-        """
-        return {**self.__dict__, "workers": HERE, "report": _silent}
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
@@ -159,10 +149,6 @@ class State:
     @property
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
-
-    def __getstate__(self) -> dict[str, object]:
-        """Leave out the study with its scans when a state is sent to another process."""
-        return {**self.__dict__, "study": None}
 
     def without(self, name: str) -> State:
         """Return the model without the named effect, refitted from the current parameters."""

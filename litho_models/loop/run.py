@@ -127,10 +127,6 @@ def close_loop(
             store=opened,
         )
         closed = close(study, bases)
-
-        def close_again(scans: Sequence[PrintedScan], among: Mapping[str, nn.Module] = bases) -> Closed:
-            return close(Study.dealt(scans, folds, seed, places), among)
-
         models = HeldOut(study)
         alone: list[ScanFinding] = []
         if not study.of_films:
@@ -141,11 +137,12 @@ def close_loop(
         errors, left_out_nm = models.errors(closed), models.left_out_nm(closed)
         if nested:
             chosen = {closed.base_name: bases[closed.base_name]}
-            errors += nested_errors(study, nested, partial(close_again, among=chosen))
+            errors += nested_errors(study, nested, partial(close_again, chosen, folds, seed))
         if open_lock_box and locked:
             for stage, predicted in models.of_others(closed, locked).items():
                 errors += error_rows(locked, *predicted, seed, model=stage, held_out="locked")
-        planted = [plant(*one, closed, close_again) for one in wanted]
+        again = partial(close_again, bases, folds, seed)
+        planted = [plant(*one, closed, again) for one in wanted]
         result = record(
             closed,
             errors,
@@ -164,6 +161,15 @@ def close_loop(
         write_report(result, study.scans, map(models.maps_um, closed.ends.values()), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
     return result
+
+
+def close_again(
+    bases: Mapping[str, nn.Module], folds: int, seed: int, scans: Sequence[PrintedScan]
+) -> Closed:
+    """Run the search of a loop on other scans, which are divided into at most ``folds`` folds. ``bases`` are
+    the base models, keyed by name.
+    """
+    return close(Study.dealt(scans, folds, seed), bases)
 
 
 def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:

@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from litho_data.sharing.workers import run_jobs
 from litho_models.effects import Effect, get_effect, screened_effects
 from litho_models.effects.effect import Role
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import Judgement, judge, judge_states, told_apart
-from litho_models.loop.model import Twin, Values
+from litho_models.loop.model import Values
 from litho_models.loop.screening import Screened, Screening, Secants
 from litho_models.scan_terms.grouped import ALL
 
@@ -155,7 +154,7 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secan
         near = (one for one in left[1:] if one.gain_nm2 >= 0.3 * best.gain_nm2)
         entering = [best, *(one for one in near if abs(screening.cosine(best, one)) >= 0.5)][:4]
         left = [one for one in left if one not in entering]
-        fitted = _fitted(found.state, entering)
+        fitted = {one.name: _fitted(found.state, one) for one in entering}
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
             judgement = judge_states(found.state, fitted[one.name])
             if refused := judgement.reason(one.by):
@@ -195,17 +194,9 @@ def _alike(
     return (*by_fit, *by_screening)
 
 
-def _fitted(state: State, entering: Sequence[Screened]) -> dict[str, State]:
-    study = state.study
-    jobs = [(one.name, state.twin.with_effect(one.name, one.by, one.start()), study) for one in entering]
-    done = run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])
-    return {name: replace(own, study=study) for (name, *_), own in done}
-
-
-def _fit(job: tuple[str, Twin, Study]) -> State:
-    name, twin, study = job
-    study.report(f"fitting {name}")
-    return fit_state(twin, study)
+def _fitted(state: State, one: Screened) -> State:
+    state.study.report(f"fitting {one.name}")
+    return fit_state(state.twin.with_effect(one.name, one.by, one.start()), state.study)
 
 
 def same_change(before: State, one: State, other: State) -> bool:

@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import forkserver, get_context
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,10 +29,11 @@ from litho_design.workflows.compare import compare
 from litho_models.boards.board import make_draws
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
+from litho_models.fitting.fit import common_geometry
 from litho_models.loop.bases import bases_for
-from litho_models.loop.errors import HeldOut
-from litho_models.loop.search import _fitted
-from litho_models.scan_terms.grouped import ALL
+from litho_models.loop.errors import HeldOut, nested_errors
+from litho_models.loop.run import close_again
+from litho_models.models import build_model
 from tests.jobs import die, die_once, large, new_pages, refuse, told
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import bare_state, planted, study_of
@@ -172,29 +172,20 @@ def test_a_benchmark_is_the_same_to_the_bit(
 
 
 @pytest.mark.long
-def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
-    law, scans = "height-times-slope-size-x", planted(count=6)
-    here = study_of(scans, folds=2)
+def test_fits_and_searches_without_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
+    here = study_of(planted(count=6), folds=2)
     studies = here, replace(here, workers=Workers(dask=address))
     state = bare_state(here)
-    entering = [
-        SimpleNamespace(name=name, by=ALL, start=lambda: {"": {"strength": 0.01}})
-        for name in (law, "height-power-2")
-    ]
-    one, other = (_fitted(replace(state, study=study), entering) for study in studies)
-    assert set(one) == set(other) == {law, "height-power-2"}
-    for name, own in one.items():
-        assert all(
-            (a.vector == b.vector).all() for a, b in zip(own.per_fold, other[name].per_fold, strict=True)
-        )
-        assert (own.freed_nm2 == other[name].freed_nm2).all()
     maps = [HeldOut(study).maps_um(state) for study in studies]
     assert all((own == its).all() for own, its in zip(*maps, strict=True))
+    again = partial(close_again, {"affine": build_model("affine", **common_geometry(here.scans))}, 2, 0)
+    one, other = (nested_errors(study, "folds", again) for study in studies)
+    assert one == other
     bases = [
         bases_for("features", study, cache=tmp_path / name)["features"]
         for name, study in zip("ab", studies, strict=True)
     ]
-    assert len(bases[0].models) == len(bases[1].models) == 2
+    assert len(bases[0].models) == len(bases[1].models) == len(here.folds) + 1
     for own, its in zip(*(base.state_dict().values() for base in bases), strict=True):
         assert (own == its).all()
 
