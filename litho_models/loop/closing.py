@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
 
 from torch import nn
 
@@ -30,7 +29,6 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import Stage
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
-from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
 # Assumed ratio of the duration of a loop to that of its first fits. For four datasets of heights, this ratio
@@ -173,47 +171,6 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         rest=rest,
         untestable=excluded,
     )
-
-
-def with_answer(
-    closed: Closed, cause: Cause | None, name: str, values: Mapping[str, float], **known: Any
-) -> Closed:
-    """Replace a cause or law in the result of a loop by the effect that is still possible after later prints,
-    and return the new result. Each model that contained the cause is fitted again with the effect instead of
-    the cause.
-
-    Args:
-        closed: the result.
-        cause: the cause or law to replace, or None if the effect is added as a further cause.
-        name: name of the effect. It may be the name of the cause itself.
-        values: starting values of the parameters of the effect.
-        known: the fields ``alike``, ``excluded`` and ``role`` of the new `Cause`.
-    """
-    same = cause is not None and cause.name == name
-
-    @cache
-    def fitted(state: State) -> State:
-        if same or (cause and cause.name not in state.twin.names):
-            return state
-        twin = state.twin.without(cause.name) if cause else state.twin
-        return fit_state(twin.with_effect(name, ALL, {"": values}), state.study)
-
-    if cause and same:
-        answer = replace(cause, **known)
-    else:
-        final = fitted(closed.final)
-        judgement = judge_states(final.without(name), final)
-        family_p = {**closed.lawful.first, **closed.named.first}[name].family_p
-        answer = Cause(name, ALL, judgement=judgement, family_p=family_p, group_p=None, **known)
-
-    def replaced(found: Found) -> Found:
-        causes = [answer if one is cause else one for one in found.causes]
-        return replace(found, state=fitted(found.state), causes=causes)
-
-    named, lawful, described = map(replaced, (closed.named, closed.lawful, closed.described))
-    if cause is None:
-        named.causes.append(answer)
-    return replace(closed, named=named, lawful=lawful, described=described)
 
 
 def _rest_beside(start: State) -> Callable[[State], Rest]:

@@ -31,9 +31,12 @@ from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, 
 from litho_models.loop.fits import RULES, TwinProblem
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import ALL_FREE, PreparedScan, sample_border_px
+from litho_models.loop.record import Decided
 from litho_models.loop.run import QUESTIONS_FILE
 from litho_models.scan_terms import freed_um
 
+# The answer that none of the rivals is right.
+NONE: Decided = "none of them"
 _TILE_PX = 64
 
 

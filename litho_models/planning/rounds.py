@@ -24,10 +24,8 @@ from scipy.stats import f_oneway
 from litho_data.foundation import Array, InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.effects import get_effect
-from litho_models.effects.effect import Role
 from litho_models.loop import run
-from litho_models.loop.closing import Closed, with_answer
+from litho_models.loop.closing import Closed
 from litho_models.loop.fits import Study
 from litho_models.loop.judging import CONFIRM_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
@@ -35,15 +33,14 @@ from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision, ScanFinding
 from litho_models.loop.single_scans import coefficients
 from litho_models.planning.answers import Z_DECIDED, surely_better, variance_ratio
+from litho_models.planning.decided import with_decisions
 from litho_models.planning.open_questions import open_questions
-from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
+from litho_models.planning.questions import NONE, OpenQuestions, Question, fit_rivals, left_nm
 from litho_models.scan_terms import freed_um, row_index, shrunk_line_offsets, terms_of_effect
 from litho_models.scan_terms.lines import axis_along
 
-NONE: Decided = "none of them"
 UNSEEN: Decided = "not shown by these prints"
 BOTH = PRINTER, MICROSCOPE = "the printer", "the microscope"
-_ROLES: dict[Owner | None, Role] = {"printer": "process", "microscope": "measurement"}
 _BLOCK_PX = 32
 
 
@@ -221,40 +218,6 @@ class Judge:
             f"rows and {scanned:.1f} nm² along the scan lines (z = {z:.1f})"
         )
         return _decision(question, turned, _left(z >= Z_DECIDED, z <= -Z_DECIDED), told)
-
-
-def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Decision]) -> Closed:
-    """Return the result of the loop with the causes that remain possible after the decisions. If new prints
-    exclude a cause, it is replaced by an effect that remains possible. If only one answer remains, its effect
-    is named as the cause. The role of this effect is ``process`` if the answer states that the printer causes
-    it, ``measurement`` if the answer states the microscope, and otherwise the role in the catalogue.
-    """
-    rivals_of = {one.name: one.rivals for one in open_.questions}
-    for decision in decisions:
-        name, rivals = decision.question, rivals_of[decision.question]
-        left = [one for one in rivals if one.name in decision.left]
-        cause = next((one for one in closed.traced if one.name == name), None)
-        if not left or decision.verdict == NONE or (cause is None and len(left) > 1):
-            continue
-        # If the cause itself remains possible, it is kept.
-        best = min(left, key=lambda one: one.effect != name)
-        if best.effect != name and best.effect in closed.final.twin.names:
-            continue
-        remain = {one.effect for one in left}
-        excluded = dict.fromkeys(one.effect for one in rivals if one.effect not in remain)
-        role, alike = None, (name, *cause.alike) if cause else ()
-        if len(left) == 1:
-            role, alike = _ROLES.get(best.owner, get_effect(best.effect).role), ()
-        closed = with_answer(
-            closed,
-            cause,
-            best.effect,
-            best.effects[best.effect],
-            alike=tuple(one for one in alike if one not in {best.effect, *excluded}),
-            excluded=tuple(excluded),
-            role=role,
-        )
-    return closed
 
 
 def compared(

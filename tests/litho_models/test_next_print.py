@@ -49,9 +49,11 @@ from litho_models.loop.search import Cause, Found
 from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
+from litho_models.planning.decided import with_decisions
 from litho_models.planning.layouts import Limits, assemble, climb, score, starts
 from litho_models.planning.open_questions import _cutoff_per_um, _owners, _question, _rivals, open_questions
 from litho_models.planning.questions import (
+    NONE,
     NoiseSpectrum,
     OpenQuestions,
     Owner,
@@ -71,16 +73,7 @@ from litho_models.planning.rivalry import (
     planned_scans,
     predict,
 )
-from litho_models.planning.rounds import (
-    MICROSCOPE,
-    NONE,
-    PRINTER,
-    Judge,
-    close_loop,
-    compared,
-    new_scans,
-    with_decisions,
-)
+from litho_models.planning.rounds import MICROSCOPE, PRINTER, Judge, close_loop, compared, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
