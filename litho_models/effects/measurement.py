@@ -13,8 +13,6 @@ from torch.nn import functional
 from litho_models.effects.effect import DIRECTION, FieldContext, Parameter, Values, of_microscope
 from litho_models.effects.filters import add_blur, add_warp
 
-# Weights of cubic interpolation half-way between four neighbours.
-_MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
 _SHARPEST_UM = 1e-3
 # Radius of an asymmetric tip along its sharper axis, relative to the radius along the other axis.
 _SHARPER = 0.25
@@ -136,43 +134,33 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """Dilate rows by a parabola. The surface is approximated by linear pieces that are half a pixel long.
     ``height`` and the result have shape (..., nx).
 
-    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point does
-    not lie on the piece, the tip touches the piece at the end that is nearer to this point.
+    The tip touches an end or the inside of a piece. It can touch the inside of a piece of slope s only at the
+    distance R s from the axis of the tip, so at most one pixel has its axis there.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
-    last = height[..., -1:]
-    # Cubic polynomials through four neighbours give the heights half-way between pixels.
-    near = functional.pad(height, (1, 1, 0, 0), mode="replicate").unfold(-1, len(_MIDDLE), 1)
-    middles = torch.cat([near @ height.new_tensor(_MIDDLE), last], dim=-1)
-    # The heights at which the pieces begin: at each pixel, and at the mid-point to the right of each pixel.
-    begins = torch.stack([height, middles], dim=-1).flatten(-2)
-    slopes = torch.diff(begins, append=last) / half_um
-    steepest = float(slopes.detach().abs().max())
-    # The tip cannot touch a point that is farther from its axis than R s, where s is the steepest slope. Nor
-    # can it touch a point that is so far away that the parabola has risen there by more than the whole height
-    # range.
-    deepest_um = math.sqrt(2 * float((radius_um * (begins.max() - begins.min())).detach()))
-    farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
-    reach = 2 * min(math.ceil(farthest_um / pitch_um) + 1, size)
-    edge = (reach, reach, 0, 0)
-    starts, rises = functional.pad(begins, edge, mode="replicate"), functional.pad(slopes, edge)
-    # The gradient of the maximum is the gradient of the piece that the tip touches. The search for this piece
-    # runs without gradients, because with gradients it would keep all pieces in memory.
-    with torch.no_grad():
-        highest, on = height, torch.zeros_like(height, dtype=torch.int32)
-        touches = radius_um * rises
-        bend = float(-0.5 / radius_um)
-        for offset in range(-reach, reach):
-            start, slope, touch = (
-                part[..., reach + offset :: 2][..., :size] for part in (starts, rises, touches)
-            )
-            near_um = offset * half_um
-            touch = touch.clamp(near_um, near_um + half_um)
-            tip = start.add(slope, alpha=-near_um).addcmul_(touch, slope.add(touch, alpha=bend))
-            on.masked_fill_(tip > highest, offset)
-            highest = torch.maximum(highest, tip)
-    piece = on + 2 * torch.arange(size, device=height.device) + reach
-    start, slope = (part.gather(-1, piece) for part in (starts, rises))
-    begins_um = on.to(height.dtype) * half_um
-    touch = (radius_um * slope).clamp(begins_um, begins_um + half_um)
-    return start + slope * (touch - begins_um) - touch**2 / (2 * radius_um)
+    pixel = torch.arange(size, device=height.device, dtype=height.dtype)
+    # Cubic polynomials through four neighbours give the heights half-way between pixels. Beyond its last
+    # pixel, a row is level.
+    before, here, after, beyond = (
+        functional.pad(height, (1, 2, 0, 0), mode="replicate").unfold(-1, size, 1).unbind(-2)
+    )
+    middles = torch.where(pixel < size - 1, (9 * (here + after) - before - beyond) / 16, height)
+    # The tip cannot touch a point so far away that the parabola has risen there by more than the whole height
+    # range. A cubic polynomial overshoots the range by at most an eighth at each end.
+    range_um = 1.25 * float((height.max() - height.min()).detach())
+    reach = min(math.ceil(math.sqrt(2 * float(radius_um.detach()) * range_um) / pitch_um), size)
+    highest = height
+    for begins, ends, offset_um in ((height, middles, 0.0), (middles, after, half_um)):
+        padded = functional.pad(begins, (reach, reach, 0, 0), mode="replicate")
+        for number in range(2 * reach):
+            away_um = (number - reach) * pitch_um + offset_um
+            parabola_um = away_um**2 / (2 * radius_um)
+            highest = torch.maximum(highest, padded[..., number : number + size] - parabola_um)
+        slope = (ends - begins) / half_um
+        touch_um = radius_um * slope
+        axis = (pixel - (touch_um.detach() / pitch_um).floor()).clamp(0, size - 1)
+        away_um = (pixel - axis) * pitch_um + offset_um
+        inside = (away_um <= touch_um) & (touch_um < away_um + half_um)
+        touched = torch.where(inside, begins + slope * (touch_um / 2 - away_um), -math.inf)
+        highest = highest.scatter_reduce(-1, axis.long(), touched, "amax")
+    return highest
