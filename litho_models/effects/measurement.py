@@ -145,18 +145,20 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
         functional.pad(height, (1, 2, 0, 0), mode="replicate").unfold(-1, size, 1).unbind(-2)
     )
     middles = torch.where(pixel < size - 1, (9 * (here + after) - before - beyond) / 16, height)
-    # The tip cannot touch a point so far away that the parabola has risen there by more than the whole height
-    # range. A cubic polynomial overshoots the range by at most an eighth at each end.
+    slopes = (middles - height) / half_um, (after - middles) / half_um
+    # The tip cannot touch a point that is farther from its axis than R s, where s is the steepest slope. Nor
+    # can it touch a point that is so far away that the parabola has risen there by more than the whole height
+    # range. A cubic polynomial overshoots this range by at most an eighth at each end.
+    steepest, radius = max(float(one.detach().abs().max()) for one in slopes), float(radius_um.detach())
     range_um = 1.25 * float((height.max() - height.min()).detach())
-    reach = min(math.ceil(math.sqrt(2 * float(radius_um.detach()) * range_um) / pitch_um), size)
+    reach = min(math.ceil(min(radius * steepest, math.sqrt(2 * radius * range_um)) / pitch_um), size)
     highest = height
-    for begins, ends, offset_um in ((height, middles, 0.0), (middles, after, half_um)):
+    for begins, slope, offset_um in zip((height, middles), slopes, (0.0, half_um), strict=True):
         padded = functional.pad(begins, (reach, reach, 0, 0), mode="replicate")
-        for number in range(2 * reach):
+        for number in range(2 * reach + 1):
             away_um = (number - reach) * pitch_um + offset_um
             parabola_um = away_um**2 / (2 * radius_um)
             highest = torch.maximum(highest, padded[..., number : number + size] - parabola_um)
-        slope = (ends - begins) / half_um
         touch_um = radius_um * slope
         axis = (pixel - (touch_um.detach() / pitch_um).floor()).clamp(0, size - 1)
         away_um = (pixel - axis) * pitch_um + offset_um
