@@ -156,8 +156,8 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     for begins, slope, offset_um in zip((height, middles), slopes, (0.0, half_um), strict=True):
         padded = functional.pad(begins, (reach, reach, 0, 0), mode="replicate")
         for number in range(2 * reach + 1):
-            away_um = (number - reach) * pitch_um + offset_um
-            parabola_um = away_um**2 / (2 * radius_um)
+            distance_um = (number - reach) * pitch_um + offset_um
+            parabola_um = distance_um**2 / (2 * radius_um)
             highest = torch.maximum(highest, padded[..., number : number + size] - parabola_um)
         touch_um = radius_um * slope
         axis = (pixel - (touch_um.detach() / pitch_um).floor()).clamp(0, size - 1)
