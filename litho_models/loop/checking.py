@@ -17,11 +17,11 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, fit_state
+from litho_models.loop.fits import State
 from litho_models.loop.judging import judge_states
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screening, Secants
-from litho_models.loop.search import Cause, describe, with_table
+from litho_models.loop.search import Cause, describe, with_effect
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
 # An effect is rejected as the cause if variants of the change that it makes would add more than this fraction
@@ -121,7 +121,7 @@ class Check:
             if not promising:
                 break
             law = max(promising, key=lambda one: one.gain_nm2)
-            state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), state.study)
+            state = with_effect(state, law)
             numbers -= law.numbers
             names.append(law.name)
             if not judge_states(self.state, state).reason():
@@ -137,8 +137,8 @@ class Check:
         the model with this table.
         """
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
-            if table.judgement.gain_nm2 > 2 * cause.judgement.gain_nm2:
-                both = with_table(self.state, table)
+            if table.gain_nm2 > 2 * cause.judgement.gain_nm2:
+                both = with_effect(self.state, table, from_here=True)
                 if unneeded := judge_states(both.without(cause.name), both).reason(cause.by):
                     reason = f"it is not needed when {table.name} is in the model: {unneeded}"
                     return replace(cause, reason=reason)

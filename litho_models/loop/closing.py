@@ -27,8 +27,8 @@ from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import Stage
-from litho_models.loop.screening import Secants
-from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
+from litho_models.loop.screening import Screened, Secants
+from litho_models.loop.search import Cause, Found, describe, search, untestable, with_effect
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
 # Assumed ratio of the duration of a loop to that of its first fits. For four datasets of heights, this ratio
@@ -283,8 +283,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         if named.causes:
             in_place = lawful.state
             # A table can fit almost anything, so it must gain more than all causes together.
-            if described and described[0].judgement.gain_nm2 > start.mse_nm2 - named.state.mse_nm2:
-                in_place = with_table(in_place, described[0])
+            if described and described[0].gain_nm2 > start.mse_nm2 - named.state.mse_nm2:
+                in_place = with_effect(in_place, described[0], from_here=True)
             left_nm2 = rest(in_place).mean_nm2
             check = Check(in_place, [*named.causes, *lawful.causes], laws, tables, left_nm2, secants)
             named.causes = [check.of(cause) for cause in named.causes]
@@ -304,15 +304,15 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
             lawful.state = lawful.state.without(one.name)
 
 
-def _in_model(state: State, described: Sequence[Cause]) -> Found:
+def _in_model(state: State, described: Sequence[Screened]) -> Found:
     """Add tables to the model, one after the other. A table is kept only if held-out scans still confirm it
     after it has been fitted together with all other parameters of the model.
     """
     found = Found(state)
     for table in described:
-        fitted = with_table(found.state, table)
+        fitted = with_effect(found.state, table, from_here=True)
         judgement = judge_states(found.state, fitted)
         if not judgement.reason(table.by):
             found.state = fitted
-            found.causes.append(replace(table, judgement=judgement))
+            found.causes.append(Cause(table.name, table.by, (), judgement, table.family_p, table.group_p))
     return found

@@ -18,7 +18,6 @@ from litho_models.effects import Effect, get_effect, screened_effects
 from litho_models.effects.effect import Role
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import Judgement, judge, judge_states, told_apart
-from litho_models.loop.model import Values
 from litho_models.loop.screening import Screened, Screening, Secants
 from litho_models.scan_terms.grouped import ALL
 
@@ -40,7 +39,6 @@ class Cause:
             and the test of this gain.
         family_p: p value of the effect in the screening of all candidates.
         group_p: p value of the grouping; None if the strength does not differ by group.
-        values: for a table, the starting values of its parameters, keyed by group label.
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
         corrects: whether the effect was rejected because it may merely correct the formula of another effect.
         survives_on: names of the other base models that also need this effect beside all others.
@@ -55,7 +53,6 @@ class Cause:
     judgement: Judgement
     family_p: float
     group_p: float | None
-    values: Values = field(default_factory=dict)
     reason: str = ""
     corrects: bool = False
     survives_on: tuple[str, ...] = ()
@@ -122,21 +119,22 @@ def search(
 
 def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Sequence[Secants] | None = None
-) -> list[Cause]:
+) -> list[Screened]:
     """Return the tables that held-out scans confirm as an improvement of a model. Each table is judged alone,
     by a linear fit, and is not added to the model. At most ``most`` tables are judged.
     """
-    found: list[Cause] = []
-    for one in Screening(state, tables, secants).standing()[:most]:
-        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
-        if not judgement.reason(one.by):
-            found.append(Cause(one.name, one.by, (), judgement, one.family_p, one.group_p, one.start()))
-    return found
+    return [
+        one
+        for one in Screening(state, tables, secants).standing()[:most]
+        if not judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study).reason(one.by)
+    ]
 
 
-def with_table(state: State, table: Cause) -> State:
-    """Add an effect from ``TABLES`` to a model, and refit all parameters of the model."""
-    return fit_state(state.twin.with_effect(table.name, table.by, table.values), state.study, from_here=True)
+def with_effect(state: State, one: Screened, *, from_here: bool = False) -> State:
+    """Add an effect to a model, and refit all parameters of the model. ``from_here`` is as for
+    ``fit_state``.
+    """
+    return fit_state(state.twin.with_effect(one.name, one.by, one.start()), state.study, from_here=from_here)
 
 
 def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secants] | None) -> bool:
@@ -154,7 +152,10 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secan
         near = (one for one in left[1:] if one.gain_nm2 >= 0.3 * best.gain_nm2)
         entering = [best, *(one for one in near if abs(screening.cosine(best, one)) >= 0.5)][:4]
         left = [one for one in left if one not in entering]
-        fitted = {one.name: _fitted(found.state, one) for one in entering}
+        fitted = {}
+        for one in entering:
+            study.report(f"fitting {one.name}")
+            fitted[one.name] = with_effect(found.state, one)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
             judgement = judge_states(found.state, fitted[one.name])
             if refused := judgement.reason(one.by):
@@ -192,11 +193,6 @@ def _alike(
         and abs(screening.cosine(one, other)) >= SAME_COSINE
     ]
     return (*by_fit, *by_screening)
-
-
-def _fitted(state: State, one: Screened) -> State:
-    state.study.report(f"fitting {one.name}")
-    return fit_state(state.twin.with_effect(one.name, one.by, one.start()), state.study)
 
 
 def same_change(before: State, one: State, other: State) -> bool:

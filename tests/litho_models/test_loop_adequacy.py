@@ -162,8 +162,9 @@ def test_a_name_is_refused_if_laws_halve_its_gain(
 def test_a_name_is_refused_if_a_table_gains_twice_as_much_without_it(
     table_nm2: float, beside_nm2: float, falls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checking, "describe", lambda *state: [gaining("level-table", table_nm2)])
-    monkeypatch.setattr(checking, "with_table", lambda state, table: leaving(70, beside_nm2))
+    table = SimpleNamespace(name="level-table", gain_nm2=table_nm2)
+    monkeypatch.setattr(checking, "describe", lambda *state: [table])
+    monkeypatch.setattr(checking, "with_effect", lambda state, table, from_here: leaving(70, beside_nm2))
     cause = gaining("dose-exponent", 10)
     reason = Check(leaving(90), [cause], [], [], 0.0, None).beside_table(cause).reason
     assert bool(reason) is falls
