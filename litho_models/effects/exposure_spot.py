@@ -40,7 +40,9 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
         moment = (isotropic + stretch) * fx * fx + (isotropic - stretch) * fy * fy + 2 * shear * fx * fy
-        return torch.expm1(-(math.pi**2) * moment)
+        # The base blurs the sharpened frequencies again, but not beside the edges of the field, where it
+        # continues the layout. The sharpening is therefore limited to a factor of e.
+        return torch.expm1((-(math.pi**2) * moment).clamp(max=1))
 
     return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM)
 

@@ -12,6 +12,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.knobs import KNOBS
 from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
 from litho_models.effects.effect import Effect, Parameter
+from litho_models.layers.gaussian import gaussian_blur, pad_field
 from litho_models.scan_terms import SCAN_TERMS
 
 pytestmark = pytest.mark.numerics
@@ -205,6 +206,22 @@ def test_elliptical_psf_widens_one_axis_and_narrows_the_other() -> None:
         expected = math.exp(-(math.pi**2) * (isotropic + sign * stretch) * frequency**2)
         # Along the sharpened axis there is slight ringing, because the layout ends at its edge.
         assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_sharpened_spot_does_no_harm_beside_the_edges_of_the_field() -> None:
+    layout = field()[1].layout_um
+
+    def printed(layout: torch.Tensor) -> torch.Tensor:
+        context = FieldContext(layout, PITCH_UM, 1.2)
+        exposed = get_effect("elliptical-psf")(layout, {"stretch_um2": 0.02, "shear_um2": 0.17}, context)
+        return gaussian_blur(exposed, 0.25, PITCH_UM)
+
+    around = printed(pad_field(layout, 30, 30))[..., 30:-30, 30:-30]
+    # Along its short axis, the spot shrinks by 0.02 µm². Without a limit, the layout would be multiplied by
+    # exp(π² 0.02 f²) = 2e4 at the highest frequency, and the print would be wrong by 2 µm at a corner. With
+    # the limit, the layout changes by at most a factor of e. Half of the blur lies outside the field.
+    assert (printed(layout) - around).abs().max() < 0.06
+    assert (printed(layout) - around)[..., 4:-4, 4:-4].abs().max() < 0.006
 
 
 def test_long_range_proximity_keeps_a_flat_dose_and_damps_a_fast_wave() -> None:
