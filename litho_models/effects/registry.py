@@ -6,80 +6,75 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.effects import exposure_spot, exposure_writing, films, measurement, resist
 from litho_models.effects.effect import Effect, Parameter, of_single_scans
 from litho_models.effects.laws import LAWS, TABLES
-from litho_models.scan_terms.term import CREEP_DECAYS
+from litho_models.scan_terms.term import SCAN_TERMS
 
-_of_single_scans = partial(
-    Effect, stage="measurement", role="measurement", acts_on="height", apply=of_single_scans
-)
 _STEP = "scan a step standard and a bare substrate before and after the print"
-# Each scan has its own values of the parameters of a per-scan effect. They are fitted without bounds as
-# coefficients of scan terms, so only the names and units of these parameters are used.
-_HEIGHT = Parameter("µm", -0.5, 0.5, 0.03)
-_ROUGHNESS = {"sd_um": Parameter("µm", 0.0, 0.1, 0.008)}
 
-EFFECTS = (
+
+def _of_single_scans(name: str, title: str, separating: str, **facts: Any) -> Effect:
+    """Make a per-scan effect. Its parameters are the coefficients of its scan terms. They are fitted to each
+    scan without bounds, so only their names and units are used.
+    """
+    parameters = {
+        label: Parameter("1" if term.unit == "1" else "µm", -0.5, 0.5, 0.03)
+        for term in SCAN_TERMS.values()
+        if term.effect == name
+        for label in term.labels
+    }
+    usual = {"stage": "measurement", "role": "measurement", "acts_on": "height", "apply": of_single_scans}
+    return Effect(name, title, parameters=parameters, separating=separating, **{**usual, **facts})
+
+
+_PER_SCAN = (
     # Noise along the hatching (arXiv:2309.17343), which is too random for any model to predict.
     _of_single_scans(
         "line-roughness",
         "height of each written line",
+        "scan the same field at 0 and 90 degrees",
         stage="exposure",
         role="nuisance",
-        parameters=_ROUGHNESS,
-        separating="scan the same field at 0 and 90 degrees",
     ),
     # The registration maps a scan onto its layout with affine and quadratic errors.
     _of_single_scans(
         "registration-residual",
         "shift and distortion left by the registration",
-        parameters=dict.fromkeys(
-            [
-                *("shift_y_um", "y_by_y_um", "y_by_x_um", "shift_x_um", "x_by_y_um", "x_by_x_um"),
-                *(f"{axis}_by_{power}_um" for axis in "yx" for power in ("yy", "xy", "xx")),
-            ],
-            _HEIGHT,
-        ),
-        separating="alignment marks in every field",
+        "alignment marks in every field",
     ),
     # The z-scanner is calibrated only roughly.
     _of_single_scans(
         "z-gain",
         "height calibration of each scan",
-        parameters={"gain": Parameter("1", -0.2, 0.2, 0.02)},
-        separating=_STEP,
+        _STEP,
     ),
     # A scan without a reference surface has no known zero.
     _of_single_scans(
         "datum-offset",
         "zero height of each scan",
-        parameters={"offset_um": _HEIGHT},
-        separating="leave bare substrate in every field",
+        "leave bare substrate in every field",
     ),
     # The sample is tilted, the scanner bends its scans, and polynomial levelling leaves errors.
     _of_single_scans(
         "tilt-bow",
         "tilt and bow of each scan",
-        parameters=dict.fromkeys(("tilt_x_um", "tilt_y_um", "bow_xx_um", "bow_xy_um", "bow_yy_um"), _HEIGHT),
-        separating=_STEP,
+        _STEP,
     ),
     # The height drifts from one line of a raster scan to the next, and the feedback adds noise.
     _of_single_scans(
         "scan-line-stripes",
         "height offset of every scan line",
-        parameters=_ROUGHNESS,
-        separating="scan the same field at 0 and 90 degrees",
+        "scan the same field at 0 and 90 degrees",
     ),
     # The scanner creeps exponentially. The slow part of the creep looks like a bow.
     _of_single_scans(
         "slow-drift",
         "creep after the scan starts",
-        parameters=dict.fromkeys(CREEP_DECAYS, _HEIGHT),
-        separating="scan the same field twice in a row, downwards and upwards",
+        "scan the same field twice in a row, downwards and upwards",
     ),
 )
 
@@ -94,7 +89,7 @@ UNTESTABLE = {
 # The order in which effects act. The per-scan effects are listed first, but their place has no meaning,
 # because they are never part of a model.
 _FORWARD_ORDER = (
-    *EFFECTS,
+    *_PER_SCAN,
     exposure_spot.layer_stacking,
     exposure_writing.line_shortening,
     exposure_spot.dose_exponent,

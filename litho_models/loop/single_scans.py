@@ -158,7 +158,7 @@ class SingleScans:
                     seen=not reasons,
                     evidence="; ".join([*reasons, f"offsets explain {taken}"]),
                     p=excess_p,
-                    spread={"sd_um": Strength(value=float(deviation), unit="µm")},
+                    spread=dict.fromkeys(effect.parameters, Strength(value=float(deviation), unit="µm")),
                     confusable_with=[] if beaten or better else [other],
                 )
             )

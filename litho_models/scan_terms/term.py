@@ -175,7 +175,7 @@ def row_index(shape: tuple[int, ...]) -> LineIndex:
 def _drift(pixels: TermPixels) -> FloatMap:
     """Return one map for each decay time. It shows an exponential creep that starts with the scan."""
     whole = replace(pixels, at=None).time
-    return np.stack([np.exp(-pixels.time / d) - np.exp(-whole / d).mean() for d in CREEP_DECAYS.values()])
+    return np.stack([np.exp(-pixels.time / d) - np.exp(-whole / d).mean() for d in _CREEP_DECAYS])
 
 
 def _warp(pixels: TermPixels) -> FloatMap:
@@ -194,7 +194,7 @@ def _distortion(pixels: TermPixels) -> FloatMap:
 
 # Decay times of the two parts of a creep, relative to the duration of a scan. Creep that is slower than both
 # parts cannot be distinguished from the bow and is treated as part of the bow.
-CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
+_CREEP_DECAYS = (0.05, 0.2)
 
 # The terms are listed in the order in which the loop tests them.
 SCAN_TERMS: dict[str, ScanTerm] = {
@@ -207,7 +207,7 @@ SCAN_TERMS: dict[str, ScanTerm] = {
             "drift",
             "slow-drift",
             "µm",
-            tuple(f"creep over {decay:g} of the scan" for decay in CREEP_DECAYS.values()),
+            tuple(f"creep over {decay:g} of the scan" for decay in _CREEP_DECAYS),
             maps=_drift,
         ),
         ScanTerm(

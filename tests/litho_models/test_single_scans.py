@@ -79,7 +79,7 @@ def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
     found = found_with(nothing, SMALL_PX)
     assert seen(found) == {"datum-offset"}
     assert set(found) == {term.effect for term in SCAN_TERMS.values() if term.effect} | {"scars-and-spikes"}
-    spread = found["datum-offset"].spread["offset_um"]
+    spread = found["datum-offset"].spread["offset"]
     # Compute the drawn datums. The offset of the base is the same for all scans.
     scans = planted(size_px=SMALL_PX)
     drawn = [
@@ -98,7 +98,7 @@ def test_stripes_are_told_from_columns_and_not_from_the_rows_that_they_lie_on() 
     assert "line-roughness" not in seen(found)
     assert "cannot be distinguished from scan-line-stripes" in found["line-roughness"].evidence
     # The sd is known from 1,600 lines with noise of 4 / sqrt(64) nm each, measured on the other side.
-    assert one.spread["sd_um"].value == pytest.approx(0.004, rel=0.08)
+    assert one.spread["offset of a scan line"].value == pytest.approx(0.004, rel=0.08)
     lines = stripes(0.004)
     both = found_with(lambda scan, random: lines(scan, random) + lines(scan, random).T)
     assert "scan-line-stripes" not in seen(both)
@@ -134,7 +134,7 @@ def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans
 
     found = found_with(bent, SMALL_PX, shared_known=shared)["registration-residual"]
     assert found.seen is not shared
-    spread = found.spread["x_by_xx_um"]
+    spread = found.spread["shift x by x² - 1/3"]
     assert spread.unit == "µm"
     # A central difference gives sin(k) / k of a slope, which is 0.84 at a wavelength of 6 px. So the fitted
     # displacement is too large.
