@@ -112,13 +112,6 @@ def never_silent(name: str) -> Iterator[None]:
 
 def say_estimate(what: str, seconds: float) -> None:
     """If some work will take more than a minute, print one line on stderr with the expected time."""
-    if told := estimate(what, seconds):
-        say(told)
-
-
-def estimate(what: str, seconds: float) -> str:
-    """Return the line that ``say_estimate`` prints, or an empty string if the work takes at most a minute."""
-    if seconds <= _MINUTE_S:
-        return ""
-    span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
-    return f"estimate: {what} will take about {span} more"
+    if seconds > _MINUTE_S:
+        span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
+        say(f"estimate: {what} will take about {span} more")

@@ -5,6 +5,7 @@ this class. The module also computes the hash of a scan's content.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ class PrintedScan:
         along = self.scan_to_layout[:2, 0]
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
-    @property
+    @cached_property
     def usable(self) -> Array:
         """Return a bool array of shape (ny, nx) that is True at valid pixels with a finite height."""
         return np.asarray(self.valid, bool) & np.isfinite(self.height_um)

@@ -9,14 +9,12 @@ any other scan. To judge its choices on held-out scans, call ``close`` without t
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 from torch import nn
 
-from litho_data.commands.progress import estimate
 from litho_models.effects import get_effect, screened_effects
 from litho_models.effects.films import FILM_LAWS
 from litho_models.effects.laws import LAWS, TABLES
@@ -30,10 +28,6 @@ from litho_models.loop.record import Stage
 from litho_models.loop.screening import Screened, Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_effect
 from litho_models.scan_terms.measurement_fit import learn_measurement
-
-# Assumed ratio of the duration of a loop to that of its first fits. For four datasets of heights, this ratio
-# was between 11 and 33. For films, it was about 25 without an effect, but 260 or more with effects.
-_OVER_FIRST_FITS = 20
 
 
 @dataclass(frozen=True)
@@ -126,7 +120,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         bases: base models, keyed by name, from which the loop chooses one. Base models with few parameters
             are refitted together with the effects.
     """
-    plain, began_s = {}, time.monotonic()
+    plain = {}
     for name, base in bases.items():
         study.report(f"fitting {name} to {len(study.scans)} scans")
         plain[name] = fit_state(Twin.bare(base), study)
@@ -139,8 +133,6 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         if one.name not in excluded and one.of_films == freed.of_films
     ]
     starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
-    if told := estimate("the loop", _OVER_FIRST_FITS * (time.monotonic() - began_s)):
-        study.report(told + ("; if it finds effects, several times as long" if freed.of_films else ""))
     rest = _rest_beside(next(iter(starts.values())))
     results: dict[str, tuple[Found, Found, Found]] = {}
     for name, state in starts.items():

@@ -96,8 +96,6 @@ def with_bends(finding: ScanFinding, scans: Sequence[PreparedScan]) -> ScanFindi
     """Add the number of bent scans to the finding about the registration. The registration has straightened
     these scans, and all other steps of the loop use the straightened scans.
     """
-    found_um = [scan.bend_um.largest for scan in scans if scan.bend_um is not None]
-    text = f"{finding.evidence}; the registration straightened {len(found_um)} of {len(scans)} scans"
-    if found_um:
-        text += f", which were bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
-    return finding.model_copy(update={"evidence": text, "seen": finding.seen or bool(found_um)})
+    bent = sum(scan.bend_um is not None for scan in scans)
+    text = f"{finding.evidence}; the registration straightened {bent} of {len(scans)} scans"
+    return finding.model_copy(update={"evidence": text, "seen": finding.seen or bent > 0})

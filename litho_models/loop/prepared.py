@@ -51,13 +51,6 @@ class PreparedScan(PrintedScan):
     number: int
 
     @cached_property
-    def usable(self) -> Array:
-        """Return the mask of the measured pixels, which are the pixels that are scored. The mask has shape
-        (ny, nx).
-        """
-        return super().usable
-
-    @cached_property
     def sample(self) -> Array:
         """Return the flat indices of the n pixels that are used for fits and screening. These pixels are a
         part of the measured pixels, without the pixels near the edge of the scan.

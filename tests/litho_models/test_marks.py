@@ -87,5 +87,4 @@ def test_what_registration_straightened_is_told() -> None:
     assert straight.evidence == "too small to matter; the registration straightened 0 of 3 scans"
     one = straightened([replace(scans[0], bend_um=bend), *scans[1:]])
     assert one.seen
-    # Along x, 0.3 (u² - 1/3) is largest at u = 1, where it is two thirds of 0.3.
-    assert "1 of 3 scans, which were bent by up to 0.20 µm" in one.evidence
+    assert one.evidence.endswith("straightened 1 of 3 scans")
