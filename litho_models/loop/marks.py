@@ -10,11 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import label
-from scipy.stats import median_abs_deviation
 from skimage.measure import regionprops
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.roughness.noise import robust_sd
 from litho_data.store import PrintedScan, Store
 from litho_models.loop.judging import CONFIRM_P
 from litho_models.loop.prepared import PreparedScan
@@ -82,20 +82,10 @@ def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> np.ndarray:
     residuals.
     """
     residual_um = freed_um(scan.height_um, map_um, scan.usable, POLICIES["full"])
-    spread = median_abs_deviation(residual_um[scan.usable], scale=1 / 1.4826)
-    numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
+    numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * robust_sd(residual_um[scan.usable])))
     # Patches with fewer than nine pixels count as noise. A patch counts as elongated if it is at least four
     # times as long as wide.
     sides = np.reshape([one.image.shape for one in regionprops(numbered) if one.area >= 9], (-1, 2))
     # The numbers of patches that are elongated along y and along x.
     counts, axis = (sides >= 4 * sides[:, ::-1]).sum(axis=0), axis_along(scan.line)
     return counts[[axis, 1 - axis]]
-
-
-def with_bends(finding: ScanFinding, scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Add the number of bent scans to the finding about the registration. The registration has straightened
-    these scans, and all other steps of the loop use the straightened scans.
-    """
-    bent = sum(scan.bend_um is not None for scan in scans)
-    text = f"{finding.evidence}; the registration straightened {bent} of {len(scans)} scans"
-    return finding.model_copy(update={"evidence": text, "seen": finding.seen or bent > 0})

@@ -18,7 +18,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import get_effect
 from litho_models.loop.fits import Study
 from litho_models.loop.judging import CONFIRM_P, GROUPED_P, Judgement, evidence_nm2, judge
-from litho_models.loop.marks import scars, with_bends
+from litho_models.loop.marks import scars
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ScanFinding, Strength
 from litho_models.scan_terms import (
@@ -64,9 +64,14 @@ class SingleScans:
                 lines.append(name)
                 continue
             one = self._of_terms(name, accepted - own, accepted | own)
-            found.append(with_bends(one, self.scans) if name == "registration-residual" else one)
             if one.seen:
                 accepted |= own
+            if name == "registration-residual":
+                # All other steps of the loop use the scans that the registration has straightened.
+                bent = sum(scan.bend_um is not None for scan in self.scans)
+                text = f"{one.evidence}; the registration straightened {bent} of {len(self.scans)} scans"
+                one = one.model_copy(update={"evidence": text, "seen": one.seen or bent > 0})
+            found.append(one)
         return [*found, *self._of_lines(lines, accepted | {"bow"}), scars(self.scans, self.maps_um)]
 
     def _without(self, terms: Terms) -> list[np.ndarray]:

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import median_abs_deviation
 
 from litho_data.layouts.statistics import layout_statistics
+from litho_data.roughness.noise import robust_sd
 from litho_data.store import PrintedScan
 from litho_data.store.schema import DatasetId
 from litho_models.effects import get_effect
@@ -210,7 +210,7 @@ def _spread(closed: Closed, name: str, left: Sequence[np.ndarray], noise: NoiseS
             multiples.append(np.nansum(change * before) / size)
             own.append(float(noise.variance(torch.from_numpy(change))) / size**2)
     # The spread is estimated robustly (from the median absolute deviation), because a scan may have a defect.
-    spread = median_abs_deviation(multiples, scale=0.6745)
+    spread = robust_sd(np.array(multiples))
     return min(2 * float(np.sqrt(max(spread**2 - np.median(own), 0.0))), 1.0)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,9 +10,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from litho_data.register.bend import Bend
-from litho_data.store import PrintedScan, Store, open_store
-from litho_models.loop.marks import rounding, rounding_step_um, scars, with_bends
+from litho_data.store import Store, open_store
+from litho_models.loop.marks import rounding, rounding_step_um, scars
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import ScanFinding
 from tests.litho_models.loop_scans import blank_scans, with_heights
@@ -22,13 +20,6 @@ from tests.litho_models.prints import write_store
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
 # The transform of a scan that is rotated by 90°, so that its lines lie along y.
 TURNED = np.array([[0.0, -1.0, 19.2], [1.0, 0.0, 0.0], [0, 0, 1]])
-
-
-def straightened(scans: Sequence[PrintedScan]) -> ScanFinding:
-    """Return the finding about the bends of scans whose registration has left nothing."""
-    facts = {"name": "registration-residual", "title": "", "role": "measurement"}
-    left = ScanFinding.model_validate({**facts, "seen": False, "evidence": "too small to matter"})
-    return with_bends(left, prepare_scans(scans))
 
 
 @pytest.mark.parametrize("step_um", [0.001, 0.0268])
@@ -77,14 +68,3 @@ def test_scars_are_told_from_marks_across_the_lines(along: bool, turned: bool) -
     one = scars(prepare_scans(with_heights(scans, [grain] * 10)), [np.zeros(grain.shape)] * 10)
     assert one.seen is along
     assert ("30 outliers are elongated along the scan lines and 0 " in one.evidence) is along
-
-
-def test_what_registration_straightened_is_told() -> None:
-    scans = blank_scans(3, 64)
-    bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (64, 64), (0.1, 0.1))
-    straight = straightened(scans)
-    assert not straight.seen
-    assert straight.evidence == "too small to matter; the registration straightened 0 of 3 scans"
-    one = straightened([replace(scans[0], bend_um=bend), *scans[1:]])
-    assert one.seen
-    assert one.evidence.endswith("straightened 1 of 3 scans")

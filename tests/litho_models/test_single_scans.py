@@ -187,7 +187,10 @@ def test_marks_are_listed_beside_the_terms() -> None:
     study = study_of(planted(size_px=SMALL_PX))
     maps = truths(study.scans)
     bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (SMALL_PX, SMALL_PX), (0.1, 0.1))
-    bent = [replace(one, bend_um=bend) for one in study.scans]
-    found = {one.name: one for one in SingleScans(replace(study, scans=bent), maps).findings()}
-    assert "scars-and-spikes" in found
-    assert f"straightened {len(bent)} of {len(bent)} scans" in found["registration-residual"].evidence
+    for bent in (0, 1):
+        scans = [replace(one, bend_um=bend) for one in study.scans[:bent]] + [*study.scans[bent:]]
+        found = {one.name: one for one in SingleScans(replace(study, scans=scans), maps).findings()}
+        assert "scars-and-spikes" in found
+        registration = found["registration-residual"]
+        assert registration.seen is (bent > 0)
+        assert registration.evidence.endswith(f"straightened {bent} of {len(scans)} scans")
