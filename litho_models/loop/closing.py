@@ -127,10 +127,9 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     study.report("fitting the measurement errors that groups of scans share")
     freed = replace(study, scans=freed_scans(min(plain.values(), key=lambda state: state.mse_nm2)))
     excluded = untestable(freed)
+    tip_um = next((scan.tip_radius_um for scan in study.scans if scan.tip_radius_um is not None), None)
     candidates = [
-        one
-        for one in screened_effects(freed.tip_radius_um)
-        if one.name not in excluded and one.of_films == freed.of_films
+        one for one in screened_effects(tip_um) if one.name not in excluded and one.of_films == freed.of_films
     ]
     starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
     rest = _rest_beside(next(iter(starts.values())))

@@ -92,14 +92,6 @@ class Study:
         return [scan.window for scan in self.scans]
 
     @property
-    def tip_radius_um(self) -> float | None:
-        """Return the radius of the tip of the microscope, or an upper bound for this radius, µm. It is taken
-        from the first scan that states it. Return None if no scan states it.
-        """
-        known = (scan.tip_radius_um for scan in self.scans)
-        return next((radius for radius in known if radius is not None), None)
-
-    @property
     def of_films(self) -> bool:
         """Return whether the scans are electron micrographs of a film.
 

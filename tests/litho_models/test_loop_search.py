@@ -279,13 +279,6 @@ def test_what_scans_cannot_test_is_said_before_any_fit() -> None:
         assert untestable(study_of(tested)) == {}
 
 
-def test_the_radius_of_the_tip_is_that_of_the_first_scan_that_knows_it() -> None:
-    scans = planted(count=3)
-    assert study_of(scans).tip_radius_um is None
-    known = [scans[0], *(replace(scan, tip_radius_um=0.13) for scan in scans[1:])]
-    assert study_of(known).tip_radius_um == 0.13
-
-
 def test_an_experiment_that_separates_a_set_is_named_once() -> None:
     text = get_effect(THINNING).separating
     assert separating([THINNING, THINNING]) == text
