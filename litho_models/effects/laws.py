@@ -153,9 +153,11 @@ def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
     amplitude = Parameter("µm", -0.2, 0.2, 0.02)
     frequency = Parameter("1/µm", tried[0], tried[-1], 5.0, "shape", tried=tried)
     parameters = {"sine_um": amplitude, "cosine_um": amplitude, "frequency_per_um": frequency}
-    return _nameless(
+    law = _nameless(
         f"{_FIELD[on]}-wave", f"a wave in the {_FIELD[on]} itself, sin(2π f h + phase)", parameters, apply, on
     )
+    # Light makes the wave, so the development acts on a print that already has it.
+    return replace(law, stage="resist") if on == "height" else law
 
 
 def _nameless(

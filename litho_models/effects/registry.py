@@ -170,9 +170,15 @@ def in_forward_order(names: Iterable[str]) -> list[str]:
     Raises:
         InputError: there is no effect with one of these names.
     """
-    # Laws and tables act on the finished print, before the microscope.
-    known = [*CATALOGUE, *_NAMELESS]
-    return sorted(set(names), key=lambda one: (get_effect(one).stage == "measurement", known.index(one)))
+    known, nameless = [*CATALOGUE], [*_NAMELESS]
+    # Laws and tables act after all other effects of their stage.
+    last = {effect.stage: at for at, effect in enumerate(CATALOGUE.values())}
+
+    def place(name: str) -> tuple[int, int]:
+        stage = get_effect(name).stage
+        return (known.index(name), -1) if name in CATALOGUE else (last[stage], nameless.index(name))
+
+    return sorted(set(names), key=place)
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:

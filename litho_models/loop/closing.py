@@ -26,7 +26,7 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import Stage
 from litho_models.loop.screening import Screened, Secants
-from litho_models.loop.search import Cause, Found, describe, search, untestable, with_effect
+from litho_models.loop.search import Cause, Found, describe, search, untestable, with_effect, with_effects_of
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
 
@@ -134,19 +134,19 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
     rest = _rest_beside(next(iter(starts.values())))
     results: dict[str, tuple[Found, Found, Found]] = {}
-    for name, state in starts.items():
+    name = next(iter(starts))
+    while name:
         study.report(f"searching for effects that {name} lacks")
-        named = Found(state)
+        named = Found(starts[name])
         if results:
             # All base models probably lack the same causes, so each search starts from the causes that were
             # found with the first base model.
             first, _, _ = next(iter(results.values()))
-            named = first.with_base(state)
+            named = first.with_base(starts[name])
         search(named, candidates)
-        lawful, described = _checked(state, named, rest)
+        lawful, described = _checked(starts[name], named, rest)
         results[name] = named, lawful, described
-        if len(results) < len(starts) and not rest(lawful.state).matters:
-            break
+        name = _next_base({one: own for one, own in starts.items() if one not in results}, lawful, rest)
     chosen = _simplest(results)
     start, (named, lawful, described) = starts.pop(chosen), results[chosen]
     for name, rival in starts.items():
@@ -194,6 +194,23 @@ def freed_scans(state: State) -> list[PreparedScan]:
     return freed
 
 
+def _next_base(left: Mapping[str, State], lawful: Found, rest: Callable[[State], Rest]) -> str:
+    """Choose the base model with which the search is repeated: the one that fits best together with the
+    causes and laws found so far. Return an empty text if the search ends, because the last model leaves
+    nothing that can be explained, or because no other base model fits better with these effects.
+
+    Args:
+        left: the base models that have not been used yet, fitted without effects.
+        lawful: result of the last search for laws.
+        rest: function that returns the part of a model's residual that can still be explained.
+    """
+    if not left or not rest(lawful.state).matters:
+        return ""
+    mse_nm2 = {name: with_effects_of(lawful.state, one).mse_nm2 for name, one in left.items()}
+    best = min(mse_nm2, key=mse_nm2.__getitem__)
+    return best if mse_nm2[best] < (1 - 2 * SMALLEST_SHARE) * lawful.state.mse_nm2 else ""
+
+
 def _simplest(results: Mapping[str, tuple[Found, Found, Found]]) -> str:
     """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
     them is chosen.
@@ -231,7 +248,7 @@ def _tested_on(name: str, rival: State, final: State, causes: list[Cause]) -> li
         return causes
     study = rival.study
     study.report(f"testing the causes with {name}")
-    state = fit_state(replace(rival.twin, effects=final.twin.effects), study)
+    state = with_effects_of(final, rival)
     needed = (not judge_states(state.without(one.name), state).reason(one.by) for one in causes)
     return [
         replace(one, survives_on=(*one.survives_on, name)) if kept else one

@@ -91,8 +91,7 @@ class Found:
         """
         if not self.causes:
             return Found(start)
-        twin = replace(start.twin, effects=self.state.twin.effects)
-        return Found(fit_state(twin, start.study), [*self.causes], self.first)
+        return Found(with_effects_of(self.state, start), [*self.causes], self.first)
 
 
 def search(
@@ -137,6 +136,13 @@ def with_effect(state: State, one: Screened, *, from_here: bool = False) -> Stat
     return fit_state(state.twin.with_effect(one.name, one.by, one.start()), state.study, from_here=from_here)
 
 
+def with_effects_of(state: State, start: State) -> State:
+    """Return another base model, fitted together with the effects of a model. ``start`` is this base model,
+    fitted without effects.
+    """
+    return fit_state(replace(start.twin, effects=state.twin.effects), start.study)
+
+
 def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secants] | None) -> bool:
     study = found.state.study
     effects = [one for one in candidates if one.name not in found.state.twin.names]
@@ -155,7 +161,8 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secan
         fitted = {}
         for one in entering:
             study.report(f"fitting {one.name}")
-            fitted[one.name] = with_effect(found.state, one)
+            # Laws are searched for last, so the parameters of the base are close to their final values.
+            fitted[one.name] = with_effect(found.state, one, from_here=secants is not None)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
             judgement = judge_states(found.state, fitted[one.name])
             if refused := judgement.reason(one.by):

@@ -276,9 +276,15 @@ def test_a_place_map_is_a_gain_that_varies_over_the_field() -> None:
 
 
 @BY_NAME
-def test_a_law_acts_on_the_print_before_the_microscope(name: str) -> None:
+def test_a_law_acts_after_all_other_effects_of_its_stage(name: str) -> None:
     given = ["tip-dilation", name, "vertical-shrinkage", "dose-exponent"]
-    assert in_forward_order(given) == ["dose-exponent", "vertical-shrinkage", name, "tip-dilation"]
+    at = 2 if get_effect(name).stage == "development" else 1
+    wanted = ["dose-exponent", "vertical-shrinkage", "tip-dilation"]
+    assert in_forward_order(given) == [*wanted[:at], name, *wanted[at:]]
+
+
+def test_a_wave_of_light_is_in_the_print_before_it_is_developed() -> None:
+    assert in_forward_order(["slope-thinning", "height-wave"]) == ["height-wave", "slope-thinning"]
 
 
 def test_laws_and_descriptions_are_found_by_name_and_are_no_causes() -> None:

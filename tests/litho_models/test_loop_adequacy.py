@@ -211,6 +211,25 @@ def test_a_cause_survives_on_the_bases_that_need_it_beside_everything_found() ->
 
 
 @pytest.mark.parametrize(
+    ("matters", "mses_nm2", "chosen"),
+    [
+        (True, {"affine-mtf": 97.9, "blur-table": 95.0}, "blur-table"),
+        (True, {"affine-mtf": 97.9, "blur-table": 98.1}, "affine-mtf"),
+        (True, {"affine-mtf": 98.1, "blur-table": 99.0}, ""),  # less than 2 % better
+        (False, {"blur-table": 50.0}, ""),
+        (True, {}, ""),
+    ],
+)
+def test_the_next_base_fits_clearly_better_with_the_same_effects(
+    matters: bool, mses_nm2: dict[str, float], chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closing, "with_effects_of", lambda state, start: start)
+    left = {name: with_base(7, mse_nm2=mse_nm2) for name, mse_nm2 in mses_nm2.items()}
+    found = Found(with_base(7))
+    assert closing._next_base(left, found, lambda state: SimpleNamespace(matters=matters)) == chosen
+
+
+@pytest.mark.parametrize(
     ("better_nm2", "own", "chosen"),
     [
         (98.1, "hatch-ripple", "physics"),  # less than 2 % better

@@ -394,8 +394,10 @@ def test_a_base_is_chosen_by_name_or_as_the_smallest_good_one(
     # Affine leaves nothing in these few scans that can be explained, so no other base is tried.
     monkeypatch.setattr(base_models, "_COMPETING", ("affine", "identity"))
     assert chosen(base_models.AUTO) == ("affine", ["identity"])
-    # Every scan may have its own gain and datum, so identity does as well as affine.
+    # Every scan may have its own gain and datum, so identity does as well as affine, but not better.
     monkeypatch.setattr(closing, "_rest_beside", lambda start: lambda state: SimpleNamespace(matters=True))
+    assert chosen(base_models.AUTO) == ("affine", ["identity"])
+    monkeypatch.setattr(base_models, "_COMPETING", ("identity", "affine"))
     assert chosen(base_models.AUTO) == ("identity", ["affine"])
     with pytest.raises(InputError):
         chosen("nonsense")
