@@ -56,7 +56,6 @@ class Check:
         judgement and, if it is rejected, the reason.
         """
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
-        laws = ", ".join(one.name for one in self.others if get_effect(one.name).knowledge == "law")
         cause = replace(cause, judgement=judge_states(without, self.state))
         reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
@@ -66,8 +65,8 @@ class Check:
             reason = f"it is not needed when the other effects are in the model: {unneeded}"
         elif larger:
             reason = f"it may merely correct an error in the formula of {larger}"
-        elif laws and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
-            reason = f"with {laws} in the model, its gain falls to less than half"
+        elif cause.judgement.gain_nm2 < 0.5 * alone_nm2 and (law := self._replacing(cause, without)):
+            reason = f"with {law} in the model, its gain falls to less than half"
         elif outgrown := self.state.twin.at_limits(cause.name, "shape"):
             reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
@@ -81,6 +80,21 @@ class Check:
                 f"would add {100 * share:.0f} % to its gain"
             )
         return replace(cause, reason=reason, corrects=bool(larger))
+
+    def _replacing(self, cause: Cause, without: State) -> str:
+        """Return the names of the laws in the model that replace a cause, or an empty text if one of them
+        fits no better than the cause does. In that case, the cause keeps its name.
+
+        Only a law without which the gain of the cause is more than twice as large can replace the cause. It
+        is left out, and this model is compared with the model ``without`` the cause.
+        """
+        laws = [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
+        for law in laws:
+            named = self.state.without(law)
+            gain_nm2 = named.without(cause.name).mse_nm2 - named.mse_nm2
+            if gain_nm2 > 2 * cause.judgement.gain_nm2 and judge_states(named, without).reason():
+                return ""
+        return ", ".join(laws)
 
     def _larger(self, cause: Cause, without: State) -> str:
         """Test whether this cause may merely correct an error in the formula of another law or cause in the

@@ -142,7 +142,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
             # All base models probably lack the same causes, so each search starts from the causes that were
             # found with the first base model.
             first, _, _ = next(iter(results.values()))
-            named = first.with_base(starts[name])
+            named = Found(with_effects_of(first.state, starts[name]), [*first.causes], first.first)
         search(named, candidates)
         lawful, described = _checked(starts[name], named, rest)
         results[name] = named, lawful, described
@@ -212,26 +212,16 @@ def _next_base(left: Mapping[str, State], lawful: Found, rest: Callable[[State],
 
 
 def _simplest(results: Mapping[str, tuple[Found, Found, Found]]) -> str:
-    """Choose a base model. Only models with nearly the smallest error are considered, and the simplest of
-    them is chosen.
-
-    For each base model, count the causes that the search found with this base model but missed with at least
-    one other. The model with the fewest such causes is the simplest. If several models have the same number
-    of such causes, choose the model that has the fewest parameters together with its effects.
+    """Choose a base model. Of the models with nearly the smallest error, choose the one that has the fewest
+    parameters together with its effects.
 
     Args:
         results: for each base model, the results of the searches for causes, laws and tables.
     """
-    best_nm2 = min(lawful.state.mse_nm2 for _, lawful, _ in results.values())
-    close = {
-        name: (
-            sum(not all(other.has(cause) for other, _, _ in results.values()) for cause in named.causes),
-            len(lawful.state.twin.vector),
-        )
-        for name, (named, lawful, _) in results.items()
-        if lawful.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
-    }
-    return min(close, key=close.__getitem__)
+    states = {name: lawful.state for name, (_, lawful, _) in results.items()}
+    most_nm2 = (1 + 2 * SMALLEST_SHARE) * min(state.mse_nm2 for state in states.values())
+    close = (name for name, state in states.items() if state.mse_nm2 <= most_nm2)
+    return min(close, key=lambda name: len(states[name].twin.vector))
 
 
 def _tested_on(name: str, rival: State, final: State, causes: list[Cause]) -> list[Cause]:

@@ -80,19 +80,6 @@ class Found:
     refused: dict[str, str] = field(default_factory=dict)
     failed: list[Cause] = field(default_factory=list)
 
-    def has(self, cause: Cause) -> bool:
-        """Return whether the search has found a cause, or an effect that looks the same."""
-        alike = {cause.name, *cause.alike, *cause.excluded}
-        return any(alike & {one.name, *one.alike} for one in self.causes)
-
-    def with_base(self, start: State) -> Found:
-        """Return the same effects, fitted together with another base model. ``start`` is this base model,
-        fitted without effects.
-        """
-        if not self.causes:
-            return Found(start)
-        return Found(with_effects_of(self.state, start), [*self.causes], self.first)
-
 
 def search(
     found: Found, candidates: Sequence[Effect], most: int = 8, secants: Sequence[Secants] | None = None

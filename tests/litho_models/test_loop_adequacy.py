@@ -82,6 +82,7 @@ def squared(squares_nm2: float) -> dict[str, object]:
     return {
         "freed_um": [np.array([1e-3 * squares_nm2**0.5])] * 10,
         "freed_nm2": np.full(10, float(squares_nm2)),
+        "mse_nm2": float(squares_nm2),
     }
 
 
@@ -153,6 +154,34 @@ def test_a_name_is_refused_if_laws_halve_its_gain(
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 0.0)
     cause, other = gaining("slope-thinning", before_nm2), "slope-x-power" if law else "write-order-memory"
     check = Check(leaving(90), [cause, gaining(other, 5)], [], [], 0.0, None)
+    assert bool(check.of(cause).reason) is falls
+
+
+@pytest.mark.parametrize(
+    ("cause_nm2", "falls"),
+    [
+        (101.0, False),  # the cause alone is nearly as good as the law alone
+        (109.0, True),  # the law is clearly better
+        (111.0, True),  # without the law, the gain of the cause is less than twice as large
+    ],
+)
+def test_a_law_that_is_no_better_than_a_cause_leaves_it_its_name(
+    cause_nm2: float, falls: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, law = "slope-thinning", "slope-x-power"
+    errors_nm2 = {(name, law): 90.0, (law,): 100.0, (name,): cause_nm2, (): 130.0}
+
+    def model(*names: str) -> SimpleNamespace:
+        def without(other: str) -> SimpleNamespace:
+            return model(*(one for one in names if one != other))
+
+        return SimpleNamespace(
+            **squared(errors_nm2[names]), twin=twin_at_limits(), without=without, study=STUDY
+        )
+
+    monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 0.0)
+    cause = gaining(name, 30)
+    check = Check(model(name, law), [cause, gaining(law, 5)], [], [], 0.0, None)
     assert bool(check.of(cause).reason) is falls
 
 
@@ -229,26 +258,17 @@ def test_the_next_base_fits_clearly_better_with_the_same_effects(
     assert closing._next_base(left, found, lambda state: SimpleNamespace(matters=matters)) == chosen
 
 
-@pytest.mark.parametrize(
-    ("better_nm2", "own", "chosen"),
-    [
-        (98.1, "hatch-ripple", "physics"),  # less than 2 % better
-        (97.9, "hatch-ripple", "blur-table"),
-        (100.0, "slope-thinning", "affine-mtf"),  # all causes are shared, so the base with fewer numbers wins
-    ],
-)
-def test_of_equally_good_bases_the_one_whose_causes_others_share_is_chosen(
-    better_nm2: float, own: str, chosen: str
+@pytest.mark.parametrize(("better_nm2", "chosen"), [(98.1, "physics"), (97.9, "blur-table")])
+def test_of_equally_good_bases_the_one_with_the_fewest_numbers_is_chosen(
+    better_nm2: float, chosen: str
 ) -> None:
-    """Check that a base whose causes are also needed by other bases is preferred to a base with causes of its
-    own.
-    """
-    shared = gaining("slope-thinning", 10)
-    found = {
-        "affine-mtf": Found(with_base(7, 1), [replace(shared, name=own), shared]),
-        "blur-table": Found(with_base(14, 1, better_nm2), [shared]),
-        "physics": Found(with_base(7, 5), [shared]),
+    """Check a base with more numbers whose error is smaller by less or by more than 2 %."""
+    models = {
+        "affine-mtf": with_base(7, 6),
+        "blur-table": with_base(14, 1, better_nm2),
+        "physics": with_base(7, 5),
     }
+    found = {name: Found(model) for name, model in models.items()}
     assert closing._simplest({name: (own, own, own) for name, own in found.items()}) == chosen
 
 
