@@ -98,11 +98,11 @@ class Surface:
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
-    def mean(self, of: Tensor | None = None) -> Tensor:
-        """Return the Gaussian-weighted local mean of a map (by default the height). The standard deviation of
-        the Gaussian is the parameter ``length_um`` of the law.
+    def mean(self) -> Tensor:
+        """Return the Gaussian-weighted local mean of the height. The standard deviation of the Gaussian is
+        the parameter ``length_um`` of the law.
         """
-        return local_mean(self.h if of is None else of, self.values["length_um"], self.context.pitch_um, 4)
+        return local_mean(self.h, self.values["length_um"], self.context.pitch_um, 4)
 
     def trailing(self, both_sides: bool) -> Tensor:
         """Return the weighted mean height on both sides of each pixel along the rotated x axis, or only on
@@ -199,12 +199,6 @@ def _along_axis(a: str) -> Iterator[Effect]:
     yield _law(f"height-times-slope-size-{a}", f"h |∂h/∂{a}|", "1", lambda s: s.h * s.size(a))
     yield _law(f"curvature-{a}", f"∂²h/∂{a}²", "µm²", lambda s: s.slope(a, s.slope(a)))
     yield _law(f"slope-size-{a}-times-order", f"|∂h/∂{a}| t", "µm", lambda s: s.size(a) * s.context.order)
-    yield from (_slope_at(a, word) for word in _WORDS)
-
-
-def _slope_at(a: str, word: str, shapes: Mapping[str, Parameter] = {}) -> Effect:
-    name, formula = f"slope-size-{a}-times-{word}", f"|∂h/∂{a}| {word}"
-    return _law(name, formula, "µm", lambda s: s.size(a) * s.place(word), shapes)
 
 
 def _height_at(word: str, shapes: Mapping[str, Parameter] = {}) -> Effect:
@@ -264,11 +258,7 @@ _FOUND = [
     *_one_way("y"),
     _law("surroundings", "h̄ - h", "1", lambda s: s.mean() - s.h, _REACH),
     _law("blur-height", "h (h̄ - h)", "1/µm", lambda s: s.h * (s.mean() - s.h), _REACH),
-    _law("above-surroundings", "(h - h̄)²", "1/µm", lambda s: (s.h - s.mean()) ** 2, _REACH),
-    _law("steps-nearby", "mean of |∇h| within the length", "µm", lambda s: s.mean(s.size("x", "y")), _REACH),
     _height_at("rim", _NEAR),
-    _slope_at("x", "rim", _NEAR),
-    _slope_at("y", "rim", _NEAR),
     *map(_blurred_at, _WORDS),
     *_jumps("x"),
     *_jumps("y"),

@@ -55,22 +55,18 @@ class Check:
         """Check one cause in the model that contains all other effects. Return the cause with its new
         judgement and, if it is rejected, the reason.
         """
-        without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
+        without = self.state.without(cause.name)
         cause = replace(cause, judgement=judge_states(without, self.state))
         reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
         unneeded, reason = cause.judgement.reason(cause.by), ""
-        larger = "" if unneeded else self._larger(cause, without)
+        larger = "" if unneeded else self._larger(cause)
         if unneeded:
             reason = f"it is not needed when the other effects are in the model: {unneeded}"
         elif larger:
             reason = f"it may merely correct an error in the formula of {larger}"
-        elif cause.judgement.gain_nm2 < 0.5 * alone_nm2 and (law := self._replacing(cause, without)):
-            reason = f"with {law} in the model, its gain falls to less than half"
-        elif outgrown := self.state.twin.at_limits(cause.name, "shape"):
+        elif outgrown := self.state.twin.lengths_at_limits(cause.name):
             reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
-        elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
-            reason = f"its best-fitting strength exceeds the largest possible value: {exhausted}"
         # If the model still lacks a cause, variants of the change that any effect makes can explain part of
         # the missing cause. A gain of the variants that is small relative to the unexplained error is
         # therefore no evidence against the effect.
@@ -81,36 +77,14 @@ class Check:
             )
         return replace(cause, reason=reason, corrects=bool(larger))
 
-    def _replacing(self, cause: Cause, without: State) -> str:
-        """Return the names of the laws in the model that replace a cause, or an empty text if one of them
-        fits no better than the cause does. In that case, the cause keeps its name.
-
-        Only a law without which the gain of the cause is more than twice as large can replace the cause. It
-        is left out, and this model is compared with the model ``without`` the cause.
+    def _larger(self, cause: Cause) -> str:
+        """Return the name of a law whose gain is more than ten times the gain of this cause, or an empty
+        text. Every law is approximate, so the cause may merely correct an error in the formula of such a law.
         """
-        laws = [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
-        for law in laws:
-            named = self.state.without(law)
-            gain_nm2 = named.without(cause.name).mse_nm2 - named.mse_nm2
-            if gain_nm2 > 2 * cause.judgement.gain_nm2 and judge_states(named, without).reason():
-                return ""
-        return ", ".join(laws)
-
-    def _larger(self, cause: Cause, without: State) -> str:
-        """Test whether this cause may merely correct an error in the formula of another law or cause in the
-        model. Return the name of this other effect, or an empty text if there is none.
-
-        The gain of the other effect must be more than ten times the gain of this cause. If the other effect
-        is a law, this is sufficient, because every law is approximate. If the other effect is a cause, there
-        is a second condition: in the model without this cause, variants of the change that the other effect
-        makes must reduce the squared error by at least half of this cause's gain.
-        """
-        gain_nm2 = cause.judgement.gain_nm2
-        for other in self.others:
-            if other.name != cause.name and gain_nm2 < 0.1 * other.judgement.gain_nm2:
-                is_law = get_effect(other.name).knowledge == "law"
-                if is_law or reshaped_gain(without.without(other.name), without) >= 0.5 * gain_nm2:
-                    return other.name
+        for one in self.others:
+            is_law = get_effect(one.name).knowledge == "law"
+            if is_law and cause.judgement.gain_nm2 < 0.1 * one.judgement.gain_nm2:
+                return one.name
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:

@@ -18,7 +18,6 @@ from torch import nn
 from litho_data.foundation import Array
 from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain, Fields, Frame
-from litho_models.effects.effect import Kind
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import fitted_numbers, load_numbers, parameter_room
 from litho_models.loop.prepared import PreparedScan
@@ -243,21 +242,17 @@ class Twin:
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
-    def at_limits(self, name: str, kind: Kind) -> str:
-        """Return the names, separated by commas, of the parameters of an effect that lie on a limit of their
-        range in at least one group. The value ``Parameter.off`` does not count as a limit. If ``kind`` is
-        ``amplitude``, all amplitudes are examined. If ``kind`` is ``shape``, only lengths, such as ranges and
-        depths, are examined.
+    def lengths_at_limits(self, name: str) -> str:
+        """Return the names, separated by commas, of the lengths of an effect, such as ranges and depths, that
+        lie on a limit of their range.
         """
         found = []
         for slot in self.slots:
-            facts = slot.facts
-            counts = kind == "amplitude" or facts.unit in ("µm", "px")
-            limits = [*{facts.lower, facts.upper} - {facts.off}]
-            at_limit = np.isclose(self.effects[slot], limits, _AT_BOUND, _AT_BOUND).any()
-            if slot.effect == name and facts.kind == kind and counts and at_limit:
+            facts, value = slot.facts, self.effects[slot]
+            at_limit = np.isclose(value, (facts.lower, facts.upper), _AT_BOUND, _AT_BOUND).any()
+            if slot.effect == name and facts.kind == "shape" and facts.unit in ("µm", "px") and at_limit:
                 found.append(slot.parameter)
-        return ", ".join(dict.fromkeys(found))
+        return ", ".join(found)
 
 
 def is_refitted(base: nn.Module) -> bool:

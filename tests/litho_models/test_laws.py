@@ -132,8 +132,6 @@ def formulas() -> dict[str, Formula]:
         found[f"height-times-slope-size-{axis}"] = lambda h, a=axis: h * np.abs(slope(h, a))
         found[f"curvature-{axis}"] = lambda h, a=axis: slope(slope(h, a), a)
         found[f"slope-size-{axis}-times-order"] = lambda h, a=axis: np.abs(slope(h, a)) * ORDER
-        for place, own in PLACES.items():
-            found[f"slope-size-{axis}-times-{place}"] = lambda h, a=axis, p=own: np.abs(slope(h, a)) * p
         found[f"jump-along-{axis}-in-height"] = lambda h, position, a=axis: jump(a, position)
         found[f"jump-along-{axis}-in-gain"] = lambda h, position, a=axis: h * jump(a, position)
         for way in ("x", "y"):
@@ -145,19 +143,11 @@ def formulas() -> dict[str, Formula]:
     for place, own in PLACES.items():
         found[f"height-times-{place}"] = lambda h, p=own: h * p
         found[f"blur-times-{place}"] = lambda h, length_um=1.5, p=own: (mean_within(h, length_um) - h) * p
-    for axis in ("x", "y"):
-        found[f"slope-size-{axis}-times-rim"] = lambda h, length_um=1.5, a=axis: (
-            np.abs(slope(h, a)) * rim(length_um)
-        )
     found["height-times-rim"] = lambda h, length_um=1.5: h * rim(length_um)
     found["height-squared-times-order"] = lambda h: h**2 * ORDER
     found["steepness-power"] = lambda h, power: np.hypot(slope(h, "x"), slope(h, "y")) ** power
     found["surroundings"] = lambda h, length_um: mean_within(h, length_um) - h
     found["blur-height"] = lambda h, length_um: h * (mean_within(h, length_um) - h)
-    found["above-surroundings"] = lambda h, length_um: (h - mean_within(h, length_um)) ** 2
-    found["steps-nearby"] = lambda h, length_um: mean_within(
-        np.hypot(slope(h, "x"), slope(h, "y")), length_um
-    )
     found["dose-times-density"] = lambda h, length_um, power: (
         h * (mean_within(h, length_um) / FULL_UM) ** power
     )

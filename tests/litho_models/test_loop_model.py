@@ -158,13 +158,9 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
     assert highest[2] == lowest[3] == 0
     assert list(ends.free()[2:4]) == [False, False]
     assert ends.free()[:2].all()
-    # An amplitude at its null does not count as a limit.
-    assert ends.at_limits(THINNING, "amplitude") == "along_x_um"
-    vector[3] = facts["along_x_um"].upper
-    assert twin.at(vector).at_limits(THINNING, "amplitude") == "along_x_um"
     # The exponent is not a length, so it cannot outgrow the effect.
     vector[-1] = facts["exponent"].upper
-    assert twin.at(vector).at_limits(THINNING, "shape") == ""
+    assert twin.at(vector).lengths_at_limits(THINNING) == ""
 
 
 @pytest.mark.parametrize(("length_px", "outgrown"), [(8.0, "length_px"), (9.0, ""), (280.0, "length_px")])
@@ -172,8 +168,8 @@ def test_a_range_at_its_limit_outgrows_its_effect(length_px: float, outgrown: st
     name = "electron-backscatter"
     values = get_effect(name).with_values({"length_px": length_px})
     beam = Twin.bare(base_model()).with_effect(name, ALL, {"": values})
-    assert beam.at_limits(name, "shape") == outgrown
-    assert beam.at_limits(THINNING, "shape") == ""
+    assert beam.lengths_at_limits(name) == outgrown
+    assert beam.lengths_at_limits(THINNING) == ""
 
 
 def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:

@@ -13,7 +13,7 @@ from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
-LAW = "slope-size-x-times-r2"
+LAW = "height-times-slope-x"
 EFFECTS = [get_effect(name) for name in (LAW, "height-power-2", "rising-slope-y", "place-map")]
 
 
