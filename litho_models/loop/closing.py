@@ -1,7 +1,8 @@
 """Close the loop on a set of scans: find causes and laws in the residual of a base model.
 
-The search is run with one base model after the other, until a model leaves nothing that can be explained. The
-base models are then compared, each together with the causes and laws that were found with it.
+The search is repeated with another base model if the model leaves something that can be explained and the
+other base model fits better. The base models that were searched are then compared, each together with the
+causes and laws that were found with it.
 
 ``close`` is an estimator: it uses only the given scans for all choices and fits, and its result can predict
 any other scan. To judge its choices on held-out scans, call ``close`` without these scans.
@@ -26,7 +27,7 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import Stage
 from litho_models.loop.screening import Screened, Secants
-from litho_models.loop.search import Cause, Found, describe, search, untestable, with_effect, with_effects_of
+from litho_models.loop.search import Cause, Found, describe, search, untestable, with_effect
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
 
@@ -142,7 +143,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
             # All base models probably lack the same causes, so each search starts from the causes that were
             # found with the first base model.
             first, _, _ = next(iter(results.values()))
-            named = Found(with_effects_of(first.state, starts[name]), [*first.causes], first.first)
+            named = Found(first.state.on_base(starts[name]), [*first.causes], first.first)
         search(named, candidates)
         lawful, described = _checked(starts[name], named, rest)
         results[name] = named, lawful, described
@@ -206,7 +207,7 @@ def _next_base(left: Mapping[str, State], lawful: Found, rest: Callable[[State],
     """
     if not left or not rest(lawful.state).matters:
         return ""
-    mse_nm2 = {name: with_effects_of(lawful.state, one).mse_nm2 for name, one in left.items()}
+    mse_nm2 = {name: lawful.state.on_base(one).mse_nm2 for name, one in left.items()}
     best = min(mse_nm2, key=mse_nm2.__getitem__)
     return best if mse_nm2[best] < (1 - 2 * SMALLEST_SHARE) * lawful.state.mse_nm2 else ""
 
@@ -238,7 +239,7 @@ def _tested_on(name: str, rival: State, final: State, causes: list[Cause]) -> li
         return causes
     study = rival.study
     study.report(f"testing the causes with {name}")
-    state = with_effects_of(final, rival)
+    state = final.on_base(rival)
     needed = (not judge_states(state.without(one.name), state).reason(one.by) for one in causes)
     return [
         replace(one, survives_on=(*one.survives_on, name)) if kept else one

@@ -2,11 +2,11 @@
 and a measurement model (of the microscope) is fitted together with it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from operator import call
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,7 @@ Maps = list[np.ndarray]
 Predicted = tuple[Maps, tuple[int, int]]
 # The parts of a study that are left out one after the other.
 Parts = Literal["folds", "prints"]
+T = TypeVar("T")
 
 
 class Fit(NamedTuple):
@@ -219,7 +220,7 @@ class HeldOut:
             partial(fit_with_measurement, twin, known, study.seed, refit)
             for twin, known in zip(starts, study.others, strict=True)
         ]
-        fits = dict(run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}"))
+        fits = dict(_run(jobs, study, by))
         maps = [fits[jobs[at]].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
         return maps, (len(state.twin.vector), max(fit.measurement.numbers for fit in fits.values()))
 
@@ -246,8 +247,7 @@ def nested_errors(
         partial(_of_left_out, close_again, [scans[i] for i in rest], [scans[i] for i in own])
         for rest, own in parts.folds
     ]
-    done = run_jobs(call, jobs, study.workers, name=lambda job: f"{nested[:-1]} {jobs.index(job) + 1}")
-    predicted = dict(progress(done, "repeating all choices", len(jobs)))
+    predicted = dict(progress(_run(jobs, study, nested), "repeating all choices", len(jobs)))
     rows = []
     for stage in predicted[jobs[0]]:
         maps, numbers = zip(*(predicted[job][stage] for job in jobs), strict=True)
@@ -255,6 +255,11 @@ def nested_errors(
         every = [next(following[at]) for at in parts.fold_of]
         rows += error_rows(scans, every, max(numbers), study.seed, model=stage, held_out=f"nested {nested}")
     return rows
+
+
+def _run(jobs: Sequence[Callable[[], T]], study: Study, by: Parts) -> Iterator[tuple[Callable[[], T], T]]:
+    """Run one job for each fold (or print), and yield each job with its result."""
+    return run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}")
 
 
 def _of_left_out(

@@ -129,9 +129,9 @@ class State:
     linear: list[Linearised]
     held_out_um: list[Array]
     freed_um: list[Array]
-    # Cache of models without one of the effects, keyed by the name of this effect. Several steps of the loop
-    # need the same model.
-    _without: dict[str, State] = field(default_factory=dict, init=False)
+    # Cache of models without one of the effects, keyed by the name of this effect, and of models with another
+    # base, keyed by this base without effects. Several steps of the loop need the same model.
+    _refitted: dict[str | State, State] = field(default_factory=dict, init=False)
 
     @cached_property
     def freed_nm2(self) -> Array:
@@ -144,9 +144,17 @@ class State:
 
     def without(self, name: str) -> State:
         """Return the model without the named effect, refitted from the current parameters."""
-        if name not in self._without:
-            self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
-        return self._without[name]
+        if name not in self._refitted:
+            self._refitted[name] = fit_state(self.twin.without(name), self.study, from_here=True)
+        return self._refitted[name]
+
+    def on_base(self, start: State) -> State:
+        """Fit the effects of this model together with another base model. ``start`` is the other base model,
+        fitted without effects.
+        """
+        if start not in self._refitted:
+            self._refitted[start] = fit_state(replace(start.twin, effects=self.twin.effects), start.study)
+        return self._refitted[start]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[Array]:
         """Predict the height of the print in each scan (or window), µm, of shape (ny, nx). Each prediction is

@@ -123,13 +123,6 @@ def with_effect(state: State, one: Screened, *, from_here: bool = False) -> Stat
     return fit_state(state.twin.with_effect(one.name, one.by, one.start()), state.study, from_here=from_here)
 
 
-def with_effects_of(state: State, start: State) -> State:
-    """Return another base model, fitted together with the effects of a model. ``start`` is this base model,
-    fitted without effects.
-    """
-    return fit_state(replace(start.twin, effects=state.twin.effects), start.study)
-
-
 def _add_one(found: Found, candidates: Sequence[Effect], secants: Sequence[Secants] | None) -> bool:
     study = found.state.study
     effects = [one for one in candidates if one.name not in found.state.twin.names]

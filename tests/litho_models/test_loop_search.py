@@ -20,7 +20,6 @@ from litho_models.loop.search import (
     search,
     separating,
     untestable,
-    with_effects_of,
 )
 from litho_models.models import build_model
 from litho_models.scan_terms.grouped import ALL
@@ -78,7 +77,7 @@ def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool, in_all_s
     """
     lacking = [(MEMORY, ALL, {"": memory(0.3)}), (THINNING, ALL, {"": thinning(0.2)})][: 1 + needed]
     start = bare_state(study_of(planted(lacking, seed=1)))
-    found = search(Found(with_effects_of(in_all_scans.state, start), [*in_all_scans.causes]), CANDIDATES)
+    found = search(Found(in_all_scans.state.on_base(start), [*in_all_scans.causes]), CANDIDATES)
     assert added(found) == {name: ALL for name, *_ in lacking}
     if not needed:
         assert found.refused[THINNING]
