@@ -9,8 +9,8 @@ from litho_models.models import build_model
 from litho_models.simulator import Simulator
 
 AUTO = "auto"
-# Models from which the loop chooses one if the name is ``AUTO``. They are tried in this order, so models with
-# fewer parameters come first. The first has the same form as the Physics model of the paper.
+# Models from which the loop chooses one if the name is ``AUTO``. The search begins with the first, which has
+# the same form as the Physics model of the paper.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 # Settings of base models that differ from the defaults of these models.
 _USUAL = {"physics": {"spot": "round"}}

@@ -127,16 +127,16 @@ def _diverged(model: Simulator, step: int) -> InputError:
 
 
 class _Targets:
-    """The training data of one round: the layouts of the training scans, their measured heights without the
-    per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
+    """The training data of one round: the exposures of the training scans, their measured heights without
+    the per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
 
-    Each layout is extended by ``overhang_px`` pixels on each side, which repeat its outermost pixels. The
+    Each exposure is extended by ``overhang_px`` pixels on each side, which repeat its outermost pixels. The
     added pixels also have weight zero.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
-        self.layouts_um = [np.pad(scan.exposed_um, overhang_px, mode="edge") for scan in scans]
-        self.shapes = [layout.shape for layout in self.layouts_um]
+        self.exposures_um = [np.pad(scan.exposed_um, overhang_px, mode="edge") for scan in scans]
+        self.shapes = [layout.shape for layout in self.exposures_um]
         self.weights = [np.pad(scan.usable.astype(np.float32), overhang_px) for scan in scans]
         heights = [
             np.where(scan.usable, scan.height_um - added, 0).astype(np.float32)
@@ -186,7 +186,7 @@ def _losses(
     layout, height, weight = (
         _crops(fields, windows, margin, device)
         for fields, margin in (
-            (targets.layouts_um, reach or 0),
+            (targets.exposures_um, reach or 0),
             (targets.heights_um, 0),
             (targets.weights, 0),
         )

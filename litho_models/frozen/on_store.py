@@ -49,7 +49,9 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
 
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
-    """Predict the printed height of the layout of a scan. The result is in µm, float32 of shape (ny, nx)."""
+    """Predict the printed height of a scan from its exposure. The result is in µm, float32 of shape (ny,
+    nx).
+    """
     model.check_geometry(scan.pitch_um, scan.level_height_um)
     return model.predict(scan.exposed_um)
 

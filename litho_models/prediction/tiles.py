@@ -152,8 +152,8 @@ def blending_window(tile: Tile, like: Tensor) -> Tensor:
 
 
 def predict_scan(model: Simulator, scan: PrintedScan) -> np.ndarray:
-    """Predict the printed height of the layout of one scan, without gradients. The result is in µm, float32
-    of shape (ny, nx).
+    """Predict the printed height of one scan from its exposure, without gradients. The result is in µm,
+    float32 of shape (ny, nx).
     """
     device = next(model.parameters(), torch.empty(0)).device
     with torch.no_grad():
