@@ -95,15 +95,17 @@ class Camera:
         return (counts * top).round().clip(0, top).astype(np.uint16)
 
 
-def printed(loaded: LoadedDesign, rng: np.random.Generator, printers: Mapping[str, Any]) -> torch.Tensor:
-    """Return the heights (size, size), µm, of a print by another printer than the design expects.
+def printed(
+    loaded: LoadedDesign, rng: np.random.Generator, printers: Mapping[str, Any]
+) -> tuple[torch.Tensor, list[Any]]:
+    """Return the heights (size, size), µm, of a print by another printer than the design expects, and the
+    models that had no part in it.
 
     It is a random mixture of the prints of two models. The power spectrum of its roughness falls with the
     square of the frequency, as that of the deviation of the measured prints from Physics does.
     """
-    one, other = (
-        loaded.printed_um(printers[name]).double().numpy() for name in rng.permutation(PRINTED_BY)[:2]
-    )
+    names = rng.permutation(PRINTED_BY).tolist()
+    one, other = (loaded.printed_um(printers[name]).double().numpy() for name in names[:2])
     height = one + rng.uniform() * (other - one)
     size = len(height)
     # The field is a part of a larger one, so its slowest waves are longer than the field.
@@ -113,7 +115,7 @@ def printed(loaded: LoadedDesign, rng: np.random.Generator, printers: Mapping[st
         :size, :size
     ]
     height = height * (1 + 0.03 * rng.standard_normal()) + rng.uniform(0.002, 0.010) * rough / rough.std()
-    return torch.from_numpy(height.clip(0)).float()
+    return torch.from_numpy(height.clip(0)).float(), [printers[name] for name in names[2:]]
 
 
 def photograph(
@@ -168,12 +170,12 @@ def measure(
     kind: str, loaded: LoadedDesign, rng: np.random.Generator, printers: Any, folder: Path
 ) -> dict[str, Any]:
     """Print a design, measure it, and compare the score of the measurement with that of the true print."""
-    height = printed(loaded, rng, printers)
+    height, others = printed(loaded, rng, printers)
     truth = getattr(loaded.score(height), FIGURE)
     try:
         if kind == "photograph":
             source = photograph(loaded, height, rng, folder / "photo.png")
-            found = judge_design(loaded, [], camera=source).scores[0]
+            found = judge_design(loaded, others, camera=source).scores[-1]
         else:
             scanned = scan(loaded, height, rng, folder / "scan.txt", MARGINS_PX[kind])
             found = judge_design(loaded, [], scan=scanned).scores[0]

@@ -41,8 +41,7 @@ def score(
         list[str] | None,
         typer.Option(
             help="model that judges the design: NAME=MODEL, MODEL or `none`; MODEL may be the truth/ folder "
-            "of a virtual fab; repeatable. Without a judge, scan or photograph, the zoo's models of the same "
-            "printer are the judges"
+            "of a virtual fab; repeatable; by default the zoo's models of the same printer"
         ),
     ] = None,
     element: Annotated[

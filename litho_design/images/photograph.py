@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -37,9 +37,9 @@ _SMALLEST_COVERAGE = 0.9
 # objective.
 _VIGNETTING_SD = 0.1
 # Another printer moves the whole image of a hologram, which the scatter between the tiles of a photograph
-# does not show. These are the standard deviations of the shifts, the rotation, the scale and the tilts, as
-# shares of half the window (rms over ten holograms and five models, less the scatter between tiles).
-_PRINT_MOVES_SD = np.array([0.0045, 0.0045, 0.0045, 0.015, 0.005, 0.005])
+# does not show. These are usual standard deviations of the shifts, the rotation, the scale and the tilts, as
+# shares of half the window (rms over twenty holograms and five models, less the scatter between tiles).
+_PRINT_MOVES_SD = np.array([0.004, 0.004, 0.0, 0.015, 0.0, 0.0])
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
 _TILT_SD = 0.1
@@ -222,6 +222,7 @@ def photographed_image(
     source: PhotoSource,
     finest_per_um: float,
     averaged_um: float = 0.0,
+    others: Sequence[np.ndarray] = (),
 ) -> Photograph:
     """Register a photograph to the expected image, which was predicted for the design.
 
@@ -240,6 +241,8 @@ def photographed_image(
         finest_per_um: highest spatial frequency of the image, 2 NA / wavelength; finer detail is removed.
         averaged_um: side, µm, of the pixels over which the expected image is averaged; the photograph is
             averaged over the same area. Give 0 if the expected image contains values at points.
+        others: images of other prints of the same layout, which other models predict, each of shape (m, m).
+            They show how far the image of a print may move, which increases the uncertainty of the position.
 
     Raises:
         InputError: the file is not an image, the pitch is not positive or too coarse for the finest detail of
@@ -279,7 +282,7 @@ def photographed_image(
     wanted, scale = wanted.astype(np.float32) / wanted.max(), pitch_um / wanted_pitch_um
     ambiguous = _check_orientation(cleaned, wanted, scale, pitch_sd, orientation, photo_file)
     upright = np.ascontiguousarray(orient(cleaned, orientation))
-    fit = _fit(upright, wanted, scale, pitch_sd, further=True)
+    fit = _fit(upright, wanted, scale, pitch_sd, _print_moves(wanted, others))
     if fit.correlation < _SMALLEST_CORRELATION:
         raise _unlike(photo_file, fit.correlation)
     coverage = float(_inside(fit.window_to_photo, upright.shape, len(wanted)).mean())
@@ -462,12 +465,27 @@ class _Fit:
     gamma_sd: float = 0.0
     blur_px: float = 0.0
     other_warps: list[list[np.ndarray]] = field(default_factory=list)
+    steps_px: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    scatter_px2: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
 
-def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
+def _print_moves(wanted: np.ndarray, others: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the covariance of the movement that a print by another printer adds to the fitted pose of a
+    camera, px², shape (6, 6). Each of the ``others`` is the image behind the print that another model
+    predicts. The usual movement counts as that of one more model.
+    """
+    found = [np.diag((_PRINT_MOVES_SD * len(wanted) / 2) ** 2)]
+    for image in others:
+        fit = _fit((image / image.max()).astype(np.float32), wanted, 1.0, 1.0, np.zeros((6, 6)))
+        found.append(np.outer(fit.steps_px, fit.steps_px) - fit.scatter_px2)
+    sizes, ways = np.linalg.eigh(np.mean(found, axis=0))
+    return ways * sizes.clip(0) @ ways.T
+
+
+def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, moves_px2: np.ndarray | None = None) -> _Fit:
     """Fit a camera, so that its photograph of the expected image is as close as possible to ``photo``. If
-    ``further`` is True, the tilt of the camera and the relation between counts and light are also fitted, and
-    the fit has a higher accuracy.
+    ``moves_px2`` is given (see ``_print_moves``), the tilt of the camera and the relation between counts and
+    light are also fitted, and the fit has a higher accuracy.
     """
     import cv2
 
@@ -493,7 +511,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     alike = 4 * math.pi * blur_px**2
     # The fit ends when a step reduces the sum of squares by less than this share. If only the correlation is
     # needed, 1e-4 is accurate enough.
-    close = 1e-8 if further else 1e-4
+    close = 1e-4 if moves_px2 is None else 1e-8
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray, known: dict[int, float]) -> Any:
         target = (model - model.mean()) / model.std()
@@ -532,12 +550,14 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
         return _Fit(_camera(pose, photo.shape, side, scale), correlation)
 
-    if not further:
+    if moves_px2 is None:
         return placed()
     free += [4, 5]
     pose, found = solved(free, smooth, fixed, pose, {4: _TILT_SD, 5: _TILT_SD})
-    spread = covariance_by_tiles(found.jac, found.fun, (side, side))
-    spread += np.diag((_PRINT_MOVES_SD[free] * side / 2) ** 2)
+    scatter = covariance_by_tiles(found.jac, found.fun, (side, side))
+    steps_px, scatter_px2 = pose / unit, np.zeros((6, 6))
+    scatter_px2[np.ix_(free, free)] = scatter
+    spread = scatter + moves_px2[np.ix_(free, free)]
     scale_sd = 0.0
     if pitch_sd:
         # The photograph shows the scale of the camera times that of the print. Both are known to be close to
@@ -560,6 +580,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         ],
         position_sd_px=float(np.sqrt(np.diag(spread)[:2].mean())),
         scale_sd=scale_sd,
+        steps_px=steps_px,
+        scatter_px2=scatter_px2,
         **_light(seen(photo, pose), wanted, alike),
     )
 

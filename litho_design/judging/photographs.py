@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from litho_design.optics.imaging import Blur, richardson_lucy
 # decide between designs.
 _LARGEST_SD_DB = 0.5
 # Relative standard deviation of the effect that a blur of the camera has on a score.
-_BLUR_SD = 0.3
+_BLUR_SD = 0.2
 
 
 class PhotoScore(Record):
@@ -77,8 +78,10 @@ class PhotoVerdict:
     pictures: dict[str, np.ndarray]
 
 
-def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerdict:
-    """Score a photograph of a printed hologram's image.
+def score_hologram_photo(
+    loaded: LoadedDesign, source: PhotoSource, others: Sequence[np.ndarray] = ()
+) -> PhotoVerdict:
+    """Score a photograph of a printed hologram's image. ``others`` is as for ``photographed_image``.
 
     Raises:
         InputError: ``photographed_image`` rejects the photograph, the incident power is not positive, an
@@ -96,7 +99,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if power is not None and not power > 0:
         raise InputError("incident power of the photograph", got=power, wanted="a positive sum of counts")
     wanted = loaded.image(loaded.expected_um)
-    photo = _registered(loaded, wanted, loaded.record.layout.pitch_um, source)
+    photo = _registered(loaded, wanted, loaded.record.layout.pitch_um, source, others=others)
     target = loaded.target.cpu().double()
     resolved = loaded.bench.resolved(target)
 
@@ -132,11 +135,12 @@ def _registered(
     pitch_um: float,
     source: PhotoSource,
     averaged_um: float = 0.0,
+    others: Sequence[np.ndarray] = (),
 ) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
     # The finest fringes in the image are formed by rays from two opposite sides of the element.
     finest_per_um = 2 * optics.edge_sine(half_um) / optics.wavelength_um
-    return photographed_image(wanted, pitch_um, source, finest_per_um, averaged_um)
+    return photographed_image(wanted, pitch_um, source, finest_per_um, averaged_um, others)
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:

@@ -145,9 +145,11 @@ def judge_design(
     scores, pictures = [], {"in design": loaded.image(loaded.expected_um)}
     printed_um: Tensor | None = None
     photos: dict[str, np.ndarray] = {}
+    others_um = []
     for judge in judges:
         height, record = loaded.printed_um(judge), judge.record()
         scores.append(_print_score(loaded, record, height))
+        others_um.append(height)
         pictures[f"printed by {record.name}"] = loaded.image(height)
     if scan is not None:
         printed_um, measured, doubt_um = measured_print(loaded, scan)
@@ -162,7 +164,9 @@ def judge_design(
                 wanted="the design of a hologram or a lens",
             )
         photo = (
-            score_lens_photo(loaded, camera, printed_um) if of_lens else score_hologram_photo(loaded, camera)
+            score_lens_photo(loaded, camera, printed_um)
+            if of_lens
+            else score_hologram_photo(loaded, camera, [loaded.image(height) for height in others_um])
         )
         (photos if of_lens else pictures).update(photo.pictures)
         scores.append(

@@ -40,8 +40,9 @@ def score(
         out: folder of the score.
         judges: loaded printers, or texts of the form NAME=MODEL, MODEL or ``none``; MODEL may be the folder
             ``truth`` of a virtual fab. Judges with the same weights as a model that the search used are
-            marked as not independent. If there is no judge, scan or photograph, the judges are the zoo's
-            models that were trained on the same prints as the model of the design.
+            marked as not independent. By default, the judges are the zoo's models that were trained on the
+            same prints as the model of the design. Their prints also contribute to the uncertainty of a
+            photograph.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
             ``scan`` is also given, the photograph of an object is deconvolved with the PSF of the measured
@@ -77,11 +78,11 @@ def score(
         if isinstance(design, LoadedDesign)
         else LoadedDesign(design, device=device, element=element, band_px=band_px)
     )
-    if judges is None and scan is None and camera is None:
+    if judges is None:
         printers = models_at_hand([record.printer], record.layout, device=loaded.device)
     else:
         fit: Any = {"device": loaded.device, "extrapolate": extrapolate}
-        printers = list(load_printers(judges or (), record.layout, **fit).values())
+        printers = list(load_printers(judges, record.layout, **fit).values())
     if not printers and scan is None and camera is None:
         raise InputError("score", got="no judge", wanted="a judge, a scan or a photograph")
     with growing_folder(out, ScoreResult.FILE_NAME):

@@ -621,6 +621,19 @@ def test_the_scale_of_a_photograph_is_as_uncertain_as_its_pitch_or_the_print(
     assert np.linalg.norm(scales) == pytest.approx(scale_sd, rel=0.1, abs=1e-4)
 
 
+def test_a_judge_whose_image_is_larger_makes_the_scale_less_certain(tmp_path, printed_design):
+    loaded = LoadedDesign(printed_design)
+    light, pitch_um = loaded.image(loaded.expected_um), loaded.record.layout.pitch_um
+    cv2.imwrite(str(tmp_path / "photo.png"), Camera(noise=1e-3).counts(light, pitch_um, 0))
+    source = PhotoSource(tmp_path / "photo.png", 0.15, pitch_sd=0.5, dark_level=DARK)
+    middle = (len(light) - 1) / 2
+    larger = cv2.getRotationMatrix2D((middle, middle), 0.0, 1.03)
+    other = cv2.warpAffine(light, larger, light.shape, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    photo = photographed_image(light, pitch_um, source, 2.0, others=[other])
+    # The mean square of the usual 1.5 % and the judge's 3 %. The blurred image shows its scale to 5 %.
+    assert photo.record.scale_sd == pytest.approx(np.sqrt((0.015**2 + 0.03**2) / 2), rel=0.1)
+
+
 def test_another_scale_of_the_camera_does_not_change_the_light():
     y, x = np.mgrid[:200, :200] - 99.5
     counts = np.exp(-(x**2 + y**2) / 2 / 12**2).astype(np.float32)
