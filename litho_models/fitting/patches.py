@@ -17,8 +17,8 @@ from litho_models.fitting.crops import Window, cut
 
 
 class Patch(TypedDict):
-    """One patch: the layout with its margin, the measured height, the mask of valid pixels, the id of the
-    scan, and the row and column of the patch's first pixel in the scan.
+    """One patch: the exposed layout with its margin, the measured height, the mask of valid pixels, the id of
+    the scan, and the row and column of the patch's first pixel in the scan.
     """
 
     layout_um: Tensor
@@ -33,11 +33,12 @@ class PatchDataset(Dataset[Patch]):
     """Square patches at random positions in the scans of a store. The position of a patch depends only on the
     seed and on the index of the patch.
 
-    For a patch of side s and a margin of width m, ``layout_um`` is float32 of shape (1, s + 2m, s + 2m). With
-    the margin, a model also receives the layout around the patch. ``height_um`` is float32 of shape (1, s,
-    s), with 0 where nothing was measured. ``valid`` is a boolean mask of shape (1, s, s) that marks the
-    measured pixels. Patches are neither rotated nor flipped, because the two axes of a print differ, and a
-    lag of the beam or of the microscope acts in one direction only.
+    For a patch of side s and a margin of width m, ``layout_um`` is float32 of shape (1, s + 2m, s + 2m). It
+    is the layout times the dose of the scan, from which models predict prints. With the margin, a model also
+    receives the layout around the patch. ``height_um`` is float32 of shape (1, s, s), with 0 where nothing
+    was measured. ``valid`` is a boolean mask of shape (1, s, s) that marks the measured pixels. Patches are
+    neither rotated nor flipped, because the two axes of a print differ, and a lag of the beam or of the
+    microscope acts in one direction only.
 
     Args:
         store: dataset store or its path. Locked scans are left out.
@@ -62,7 +63,7 @@ class PatchDataset(Dataset[Patch]):
         seed: int = 0,
     ):
         self._scans = _chosen(store if isinstance(store, Store) else open_store(store), ids)
-        self._layouts_um = [scan.layout_um for scan in self._scans]
+        self._layouts_um = [scan.exposed_um for scan in self._scans]
         smallest = min(min(scan.shape) for scan in self._scans)
         if not 1 <= size_px <= smallest:
             raise InputError(

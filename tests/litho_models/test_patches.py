@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ SIZE_PX, MARGIN_PX = 48, 8
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    scans = make_scans(6, 128)
+    scans = [replace(scan, dose=1.2) for scan in make_scans(6, 128)]
     random = np.random.default_rng(0)
     for scan in scans:
         scan.valid[:] = random.random(scan.shape) < 0.9
@@ -40,7 +41,7 @@ def test_a_patch_is_the_piece_of_the_scan_that_it_names(store: Store) -> None:
         np.testing.assert_array_equal(patch["height_um"][0].numpy()[valid], height[valid])
         assert not patch["height_um"][0].numpy()[~valid].any()
         inside = patch["layout_um"][0, MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
-        np.testing.assert_array_equal(inside.numpy(), scan.layout_um[rows, columns])
+        np.testing.assert_array_equal(inside.numpy(), np.float32(1.2) * scan.layout_um[rows, columns])
 
 
 def test_locked_scans_are_never_drawn(store: Store) -> None:
