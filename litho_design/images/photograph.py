@@ -553,7 +553,11 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, moves_px2: np.n
     if moves_px2 is None:
         return placed()
     free += [4, 5]
-    pose, found = solved(free, smooth, fixed, pose, {4: _TILT_SD, 5: _TILT_SD})
+    known = {4: _TILT_SD, 5: _TILT_SD}
+    if pitch_sd:
+        # Without this, a print whose image resembles the expected one little may fit best at a wrong scale.
+        known[3] = math.hypot(pitch_sd, math.sqrt(moves_px2[3, 3]) * unit[3])
+    pose, found = solved(free, smooth, fixed, pose, known)
     scatter = covariance_by_tiles(found.jac, found.fun, (side, side))
     steps_px, scatter_px2 = pose / unit, np.zeros((6, 6))
     scatter_px2[np.ix_(free, free)] = scatter

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from scipy.special import erf, j1
 
 from benchmarks.coverage import Camera
@@ -22,6 +23,7 @@ from litho_design.images.photograph import (
     Photograph,
     _dark_level,
     _Fit,
+    _fit,
     _replace_outliers,
     _saturated,
     photographed_image,
@@ -632,6 +634,20 @@ def test_a_judge_whose_image_is_larger_makes_the_scale_less_certain(tmp_path, pr
     photo = photographed_image(light, pitch_um, source, 2.0, others=[other])
     # The mean square of the usual 1.5 % and the judge's 3 %. The blurred image shows its scale to 5 %.
     assert photo.record.scale_sd == pytest.approx(np.sqrt((0.015**2 + 0.03**2) / 2), rel=0.1)
+
+
+def test_a_scale_that_the_stated_pitch_excludes_is_not_fitted():
+    """Check an image that consists of the expected image and of a stronger copy whose size is 80 %."""
+    wanted = gaussian_filter(np.random.default_rng(0).random((128, 128)), 2.0).astype(np.float32)
+    wanted = (wanted - wanted.min()) / np.ptp(wanted)
+    smaller = cv2.getRotationMatrix2D((63.5, 63.5), 0.0, 0.8)
+    copy = cv2.warpAffine(wanted, smaller, (128, 128), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    moves_px2 = np.zeros((6, 6))
+    moves_px2[3, 3] = (0.015 * 64) ** 2
+    fit = _fit(0.35 * wanted + 0.65 * copy, wanted, 1.0, 0.02, moves_px2)
+    # The standard deviation of the scale of the camera times that of the print is 0.025. The unrestricted fit
+    # makes the image smaller by 11 %.
+    assert abs(fit.steps_px[3] / 64) < 2 * 0.025
 
 
 def test_another_scale_of_the_camera_does_not_change_the_light():
