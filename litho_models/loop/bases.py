@@ -4,15 +4,12 @@ that the user asked for, or several small models.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from operator import call
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
-from litho_data.commands.progress import progress
 from litho_data.foundation import InputError
-from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan, Store
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.base_models import AUTO, base_models
@@ -108,7 +105,6 @@ def train_folds(study: Study, trainer: Callable[[Sequence[PrintedScan]], Fitted]
     """
     # The last model is trained on all scans.
     jobs = [partial(trainer, known) for known in (*study.others, study.scans)]
-    done = run_jobs(call, jobs, study.workers, name=lambda job: f"fold {jobs.index(job)}")
-    trained = dict(progress(done, "training the base model", len(jobs)))
+    trained = study.run(jobs, "training the base model")
     fold_of = dict(zip((scan.id for scan in study.scans), study.fold_of.tolist(), strict=True))
-    return FoldedBase([trained[job].model for job in jobs], fold_of)
+    return FoldedBase([one.model for one in trained], fold_of)

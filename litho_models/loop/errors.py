@@ -2,17 +2,14 @@
 and a measurement model (of the microscope) is fitted together with it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from operator import call
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from litho_data.commands.progress import progress
 from litho_data.foundation import NM_PER_UM
-from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.closing import Closed
@@ -35,7 +32,6 @@ Maps = list[np.ndarray]
 Predicted = tuple[Maps, tuple[int, int]]
 # The parts of a study that are left out one after the other.
 Parts = Literal["folds", "prints"]
-T = TypeVar("T")
 
 
 class Fit(NamedTuple):
@@ -220,9 +216,9 @@ class HeldOut:
             partial(fit_with_measurement, twin, known, study.seed, refit)
             for twin, known in zip(starts, study.others, strict=True)
         ]
-        fits = dict(_run(jobs, study, by))
-        maps = [fits[jobs[at]].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
-        return maps, (len(state.twin.vector), max(fit.measurement.numbers for fit in fits.values()))
+        fits = study.run(jobs, "predicting held-out scans")
+        maps = [fits[at].expected_um(one) for one, at in zip(study.scans, study.fold_of, strict=True)]
+        return maps, (len(state.twin.vector), max(fit.measurement.numbers for fit in fits))
 
     def _backgrounds_um(self, plain: State) -> Maps:
         """Return the smooth background on each scan, µm, of shape (ny, nx). It is learned from the scans of
@@ -247,19 +243,14 @@ def nested_errors(
         partial(_of_left_out, close_again, [scans[i] for i in rest], [scans[i] for i in own])
         for rest, own in parts.folds
     ]
-    predicted = dict(progress(_run(jobs, study, nested), "repeating all choices", len(jobs)))
+    predicted = study.run(jobs, "repeating all choices")
     rows = []
-    for stage in predicted[jobs[0]]:
-        maps, numbers = zip(*(predicted[job][stage] for job in jobs), strict=True)
+    for stage in predicted[0]:
+        maps, numbers = zip(*(one[stage] for one in predicted), strict=True)
         following = [*map(iter, maps)]
         every = [next(following[at]) for at in parts.fold_of]
         rows += error_rows(scans, every, max(numbers), study.seed, model=stage, held_out=f"nested {nested}")
     return rows
-
-
-def _run(jobs: Sequence[Callable[[], T]], study: Study, by: Parts) -> Iterator[tuple[Callable[[], T], T]]:
-    """Run one job for each fold (or print), and yield each job with its result."""
-    return run_jobs(call, jobs, study.workers, name=lambda job: f"{by[:-1]} {jobs.index(job) + 1}")
 
 
 def _of_left_out(

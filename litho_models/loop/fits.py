@@ -11,11 +11,14 @@ from collections import ChainMap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import call
+from typing import TypeVar
 
 import numpy as np
 
+from litho_data.commands.progress import progress
 from litho_data.foundation import NM_PER_UM, Array
-from litho_data.sharing.workers import HERE, Workers
+from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import field_of
 from litho_models.effects.chain import Fields
@@ -34,6 +37,8 @@ from litho_models.loop.prepared import FREE_TERMS, PreparedScan, prepare_scans
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import grouped_folds
+
+T = TypeVar("T")
 
 RULES = Rules("squares", steps=24, tries=8, kept_above=0.8)
 
@@ -74,6 +79,14 @@ class Study:
         lists = grouped_folds(ids, [field_of(scan) for scan in scans], folds, seed)
         fold_of = np.argmax([[one in members for one in ids] for members in lists], axis=0)
         return cls(prepare_scans(scans), fold_of, seed, workers, report)
+
+    def run(self, jobs: Sequence[Callable[[], T]], what: str) -> list[T]:
+        """Run independent jobs in the pool of processes, and return their results in the order of the jobs.
+        ``what`` says in the progress display and in messages what the jobs do.
+        """
+        done = run_jobs(call, jobs, self.workers, name=lambda job: f"{what}, part {jobs.index(job) + 1}")
+        found = dict(progress(done, what, len(jobs)))
+        return [found[job] for job in jobs]
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:

@@ -4,6 +4,7 @@ finds it there.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -36,32 +37,48 @@ def parse_planted(text: str) -> tuple[Effect, float]:
 
 
 def plant(
-    effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
-) -> Planted:
-    """Plant an effect in copies of the scans, run the loop again on these copies, and return the record of
+    wanted: Sequence[tuple[Effect, float]],
+    closed: Closed,
+    close_again: Callable[[Sequence[PrintedScan]], Closed],
+) -> list[Planted]:
+    """Plant each effect in copies of the scans, run the loop again on these copies, and return the records of
     what it finds.
 
     Args:
-        effect, amount: the effect and the value of its first amplitude, as ``parse_planted`` returns them.
+        wanted: the effects, and the value of each effect's first amplitude (see ``parse_planted``).
         closed: result of the loop on the original scans.
         close_again: function that runs the same loop on the scans that it receives.
     """
-    amplitude = effect.amplitudes[0]
-    values = {effect.name: effect.with_values({amplitude: amount})}
-    twin = closed.base.twin
+    jobs = [partial(_found, *one, *_planted(*one, closed), close_again) for one in wanted]
+    return closed.given.run(jobs, "running the loop on copies of the scans")
+
+
+def _planted(effect: Effect, amount: float, closed: Closed) -> tuple[Sequence[PrintedScan], float]:
+    """Return copies of the scans in which the effect is planted, and the rms of the change, nm."""
+    twin, values = closed.base.twin, {effect.name: effect.with_values({effect.amplitudes[0]: amount})}
     changed, sizes_um = [], []
     for scan in closed.given.scans:
         here = twin.height(scan)
         added = twin.height(scan, values) - here
         changed.append(replace(scan, height_um=scan.height_um + added.astype(np.float32)))
         sizes_um.append(rms(scan.freed(scan.at_sample(added), here)))
-    again = close_again(changed)
+    return changed, NM_PER_UM * rms(sizes_um)
+
+
+def _found(
+    effect: Effect,
+    amount: float,
+    changed: Sequence[PrintedScan],
+    rms_nm: float,
+    close_again: Callable[[Sequence[PrintedScan]], Closed],
+) -> Planted:
+    amplitude, again = effect.amplitudes[0], close_again(changed)
     sets = ([one.name, *one.alike] for one in again.named.causes if again.needed_by_all(one))
     return Planted(
         name=effect.name,
         amount=amount,
         unit=effect.parameters[amplitude].unit,
-        rms_nm=NM_PER_UM * rms(sizes_um),
+        rms_nm=rms_nm,
         named=next((names for names in sets if effect.name in names), []),
         found=again.final.twin.values().get(effect.name, {}).get(amplitude),
     )

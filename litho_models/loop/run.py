@@ -141,8 +141,7 @@ def close_loop(
         if open_lock_box and locked:
             for stage, predicted in models.of_others(closed, locked).items():
                 errors += error_rows(locked, *predicted, seed, model=stage, held_out="locked")
-        again = partial(close_again, bases, folds, seed)
-        planted = [plant(*one, closed, again) for one in wanted]
+        planted = plant(wanted, closed, partial(close_again, bases, folds, seed))
         result = record(
             closed,
             errors,
