@@ -33,7 +33,7 @@ def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they
     scans = planted()
     before = [scan.height_um.copy() for scan in scans]
     closed = closed_on(scans)
-    large, tiny = (plant(get_effect(LAW), amount, closed, closed_on) for amount in (0.04, 0.0002))
+    large, tiny = plant([(get_effect(LAW), amount) for amount in (0.04, 0.0002)], closed, closed_on)
     assert (large.name, large.amount, large.unit) == (LAW, 0.04, get_effect(LAW).parameters["strength"].unit)
     assert large.named == [LAW]
     assert large.found == pytest.approx(0.04, rel=0.05)
