@@ -49,7 +49,10 @@ def plant(
         closed: result of the loop on the original scans.
         close_again: function that runs the same loop on the scans that it receives.
     """
-    jobs = [partial(_found, *one, *_planted(*one, closed), close_again) for one in wanted]
+    # Effects cannot be sent to other processes, so the jobs contain their names.
+    jobs = [
+        partial(_found, one.name, size, *_planted(one, size, closed), close_again) for one, size in wanted
+    ]
     return closed.given.run(jobs, "running the loop on copies of the scans")
 
 
@@ -66,19 +69,20 @@ def _planted(effect: Effect, amount: float, closed: Closed) -> tuple[Sequence[Pr
 
 
 def _found(
-    effect: Effect,
+    name: str,
     amount: float,
     changed: Sequence[PrintedScan],
     rms_nm: float,
     close_again: Callable[[Sequence[PrintedScan]], Closed],
 ) -> Planted:
-    amplitude, again = effect.amplitudes[0], close_again(changed)
+    effect, again = get_effect(name), close_again(changed)
+    amplitude = effect.amplitudes[0]
     sets = ([one.name, *one.alike] for one in again.named.causes if again.needed_by_all(one))
     return Planted(
-        name=effect.name,
+        name=name,
         amount=amount,
         unit=effect.parameters[amplitude].unit,
         rms_nm=rms_nm,
-        named=next((names for names in sets if effect.name in names), []),
-        found=again.final.twin.values().get(effect.name, {}).get(amplitude),
+        named=next((names for names in sets if name in names), []),
+        found=again.final.twin.values().get(name, {}).get(amplitude),
     )

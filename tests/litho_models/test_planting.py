@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.sharing.workers import HERE, Workers
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.loop.closing import Closed, _rest_beside
@@ -21,9 +23,9 @@ from tests.litho_models.loop_scans import base_model, planted, study_of
 LAW = "height-times-slope-size-x"
 
 
-def closed_on(scans: Sequence[PrintedScan]) -> Closed:
+def closed_on(scans: Sequence[PrintedScan], workers: Workers = HERE) -> Closed:
     """Run only the search of the loop, with two laws as candidates."""
-    study = study_of(scans)
+    study = replace(study_of(scans), workers=workers)
     base = fit_state(Twin.bare(base_model()), study)
     found = search(Found(base), [get_effect(LAW), get_effect("height-power-2")])
     return Closed("affine-mtf", {}, base, base, found, found, found, _rest_beside(base), {})
@@ -32,7 +34,8 @@ def closed_on(scans: Sequence[PrintedScan]) -> Closed:
 def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they_were() -> None:
     scans = planted()
     before = [scan.height_um.copy() for scan in scans]
-    closed = closed_on(scans)
+    # The copies are searched by two other processes.
+    closed = closed_on(scans, Workers(2))
     large, tiny = plant([(get_effect(LAW), amount) for amount in (0.04, 0.0002)], closed, closed_on)
     assert (large.name, large.amount, large.unit) == (LAW, 0.04, get_effect(LAW).parameters["strength"].unit)
     assert large.named == [LAW]
