@@ -37,8 +37,8 @@ _SMALLEST_COVERAGE = 0.9
 # objective.
 _VIGNETTING_SD = 0.1
 # Another printer moves the whole image of a hologram, which the scatter between the tiles of a photograph
-# does not show. These are usual standard deviations of the shifts, the rotation, the scale and the tilts, as
-# shares of half the window (rms over twenty holograms and five models, less the scatter between tiles).
+# does not show. These are typical standard deviations of the shifts, the rotation, the scale and the tilts,
+# as shares of half the window (rms over twenty holograms and five models, less the scatter between tiles).
 _PRINT_MOVES_SD = np.array([0.004, 0.004, 0.0, 0.015, 0.0, 0.0])
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
@@ -241,8 +241,9 @@ def photographed_image(
         finest_per_um: highest spatial frequency of the image, 2 NA / wavelength; finer detail is removed.
         averaged_um: side, µm, of the pixels over which the expected image is averaged; the photograph is
             averaged over the same area. Give 0 if the expected image contains values at points.
-        others: images of other prints of the same layout, which other models predict, each of shape (m, m).
-            They show how far the image of a print may move, which increases the uncertainty of the position.
+        others: images behind the prints that other models predict for the same layout, each of shape (m, m).
+            They show how far the image may move from printer to printer. This movement is added to the
+            uncertainty of the position.
 
     Raises:
         InputError: the file is not an image, the pitch is not positive or too coarse for the finest detail of
@@ -470,12 +471,15 @@ class _Fit:
 
 
 def _print_moves(wanted: np.ndarray, others: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the covariance of the movement that a print by another printer adds to the fitted pose of a
-    camera, px², shape (6, 6). Each of the ``others`` is the image behind the print that another model
-    predicts. The usual movement counts as that of one more model.
+    """Return how far the image moves from printer to printer, as a covariance of the six parameters of the
+    pose, px², shape (6, 6).
+
+    The covariance is the mean over the other models. Typical movements count as those of one more model.
+    ``others`` is as in ``photographed_image``.
     """
     found = [np.diag((_PRINT_MOVES_SD * len(wanted) / 2) ** 2)]
     for image in others:
+        # With a relative uncertainty of 1, the scale is practically free.
         fit = _fit((image / image.max()).astype(np.float32), wanted, 1.0, 1.0, np.zeros((6, 6)))
         found.append(np.outer(fit.steps_px, fit.steps_px) - fit.scatter_px2)
     sizes, ways = np.linalg.eigh(np.mean(found, axis=0))

@@ -81,7 +81,7 @@ class PhotoVerdict:
 def score_hologram_photo(
     loaded: LoadedDesign, source: PhotoSource, others: Sequence[np.ndarray] = ()
 ) -> PhotoVerdict:
-    """Score a photograph of a printed hologram's image. ``others`` is as for ``photographed_image``.
+    """Score a photograph of a printed hologram's image. For ``others``, see ``photographed_image``.
 
     Raises:
         InputError: ``photographed_image`` rejects the photograph, the incident power is not positive, an

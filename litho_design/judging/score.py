@@ -133,7 +133,8 @@ def judge_design(
 
     Args:
         judges: printers. If a printer has the same weights as a model that the search used, its score is
-            marked as not independent.
+            marked as not independent. The images behind their prints also determine how uncertain the
+            position of a hologram's image in a photograph is.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
             ``scan`` is given, the photograph of an object is also deconvolved with the PSF of the measured
@@ -142,15 +143,14 @@ def judge_design(
     Raises:
         InputError: a measurement does not match the design.
     """
-    scores, pictures = [], {"in design": loaded.image(loaded.expected_um)}
+    scores, images, pictures = [], [], {"in design": loaded.image(loaded.expected_um)}
     printed_um: Tensor | None = None
     photos: dict[str, np.ndarray] = {}
-    others_um = []
     for judge in judges:
         height, record = loaded.printed_um(judge), judge.record()
         scores.append(_print_score(loaded, record, height))
-        others_um.append(height)
-        pictures[f"printed by {record.name}"] = loaded.image(height)
+        images.append(loaded.image(height))
+        pictures[f"printed by {record.name}"] = images[-1]
     if scan is not None:
         printed_um, measured, doubt_um = measured_print(loaded, scan)
         scores.append(_print_score(loaded, measured, printed_um, doubt_um))
@@ -166,7 +166,7 @@ def judge_design(
         photo = (
             score_lens_photo(loaded, camera, printed_um)
             if of_lens
-            else score_hologram_photo(loaded, camera, [loaded.image(height) for height in others_um])
+            else score_hologram_photo(loaded, camera, images)
         )
         (photos if of_lens else pictures).update(photo.pictures)
         scores.append(

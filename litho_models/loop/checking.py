@@ -37,7 +37,8 @@ class Check:
 
     Attributes:
         state: the model, with all its effects.
-        others: the causes and laws in the model; each of them is compared with the cause that is checked.
+        others: the causes and laws in the model; the laws among them are compared with the cause that is
+            checked.
         laws, tables: all laws and tables that could replace a cause.
         left_nm2: the part of the model's mean squared residual that features of layout and position can
             still explain, nm².

@@ -142,8 +142,8 @@ class State:
     linear: list[Linearised]
     held_out_um: list[Array]
     freed_um: list[Array]
-    # Cache of models without one of the effects, keyed by the name of this effect, and of models with another
-    # base, keyed by this base without effects. Several steps of the loop need the same model.
+    # Refitted models that several steps of the loop need. A model without one effect has the name of this
+    # effect as its key. A model with another base has this base, fitted without effects, as its key.
     _refitted: dict[str | State, State] = field(default_factory=dict, init=False)
 
     @cached_property

@@ -51,13 +51,14 @@ def plant(
     """
     # Effects cannot be sent to other processes, so the jobs contain their names.
     jobs = [
-        partial(_found, one.name, size, *_planted(one, size, closed), close_again) for one, size in wanted
+        partial(_found, effect.name, amount, *_planted(effect, amount, closed), close_again)
+        for effect, amount in wanted
     ]
     return closed.given.run(jobs, "running the loop on copies of the scans")
 
 
 def _planted(effect: Effect, amount: float, closed: Closed) -> tuple[Sequence[PrintedScan], float]:
-    """Return copies of the scans in which the effect is planted, and the rms of the change, nm."""
+    """Plant an effect in copies of the scans. Return the copies and the rms change of the height, nm."""
     twin, values = closed.base.twin, {effect.name: effect.with_values({effect.amplitudes[0]: amount})}
     changed, sizes_um = [], []
     for scan in closed.given.scans:

@@ -637,7 +637,7 @@ def test_a_judge_whose_image_is_larger_makes_the_scale_less_certain(tmp_path, pr
 
 
 def test_a_scale_that_the_stated_pitch_excludes_is_not_fitted():
-    """Check an image that consists of the expected image and of a stronger copy whose size is 80 %."""
+    """Check the sum of the expected image and a stronger copy of it, reduced to 80 % of its size."""
     wanted = gaussian_filter(np.random.default_rng(0).random((128, 128)), 2.0).astype(np.float32)
     wanted = (wanted - wanted.min()) / np.ptp(wanted)
     smaller = cv2.getRotationMatrix2D((63.5, 63.5), 0.0, 0.8)
@@ -645,8 +645,8 @@ def test_a_scale_that_the_stated_pitch_excludes_is_not_fitted():
     moves_px2 = np.zeros((6, 6))
     moves_px2[3, 3] = (0.015 * 64) ** 2
     fit = _fit(0.35 * wanted + 0.65 * copy, wanted, 1.0, 0.02, moves_px2)
-    # The standard deviation of the scale of the camera times that of the print is 0.025. The unrestricted fit
-    # makes the image smaller by 11 %.
+    # The fitted scale is that of the camera (standard deviation 0.02) times that of the print (0.015), so its
+    # own standard deviation is 0.025. A fit that ignores this shrinks the image by 11 %.
     assert abs(fit.steps_px[3] / 64) < 2 * 0.025
 
 

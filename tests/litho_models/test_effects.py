@@ -218,8 +218,8 @@ def test_a_sharpened_spot_does_no_harm_beside_the_edges_of_the_field() -> None:
 
     around = printed(pad_field(layout, 30, 30))[..., 30:-30, 30:-30]
     # Along its short axis, the spot shrinks by 0.02 µm². Without a limit, the layout would be multiplied by
-    # exp(π² 0.02 f²) = 2e4 at the highest frequency, and the print would be wrong by 2 µm at a corner. With
-    # the limit of a factor of e, the error is 57 nm at a corner, and below 6 nm from the fourth pixel on.
+    # exp(π² 0.02 f²) = 2e4 at the highest frequency, and the print would be wrong by 2 µm at a corner. The
+    # factor is limited to e. The error is then 57 nm at a corner, and less than 6 nm at a distance of 4 px.
     assert (printed(layout) - around).abs().max() < 0.06
     assert (printed(layout) - around)[..., 4:-4, 4:-4].abs().max() < 0.006
 

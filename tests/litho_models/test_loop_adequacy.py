@@ -87,7 +87,7 @@ def squared(squares_nm2: float) -> dict[str, object]:
 
 
 def twin_at_limits(length: str = "") -> SimpleNamespace:
-    """Return a fitted model in which this length lies at a limit of its range."""
+    """Return a substitute for a fitted model, of which the named length is at a limit of its range."""
     return SimpleNamespace(lengths_at_limits=lambda name: length, slots=())
 
 
