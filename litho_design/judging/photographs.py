@@ -17,7 +17,8 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.measurements import PhotoSource
 from litho_design.images.noise import estimated
-from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
+from litho_design.images.photo_registration import photographed_image
+from litho_design.images.photograph import CameraRecord, Photograph
 from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject, object_name
 from litho_design.judging.loaded import LoadedDesign

@@ -21,18 +21,14 @@ from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.noise import estimated
 from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import (
-    MeasuredRecord,
-    measured_print,
-    with_more_noise,
-    with_other_fits,
-    with_other_scale,
-)
+from litho_design.judging.measured import measured_print
 from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
+from litho_design.scans.record import MeasuredRecord
+from litho_design.scans.variants import with_more_noise, with_other_fits, with_other_scale
 from litho_design.tasks.design import Design
 
 

@@ -16,39 +16,30 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.readers import read_scan
 from litho_data.register.geometry import ORIENTATIONS, orient
+from litho_design.images.camera_counts import saturated_share, without_outliers
+from litho_design.images.camera_fit import CameraFit, fit_camera, fitted_dark_level
 from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.noise import covariance_by_tiles, estimated
-from litho_design.images.photograph import (
-    CameraRecord,
-    Photograph,
-    _dark_level,
-    _Fit,
-    _fit,
-    _replace_outliers,
-    _saturated,
-    photographed_image,
-)
+from litho_design.images.photo_registration import photographed_image
+from litho_design.images.photograph import CameraRecord, Photograph
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import (
-    _LARGER,
-    MeasuredRecord,
-    _defects,
-    _displaced,
-    _Placed,
-    _removed_sd_um,
-    _shapes,
-    _warp_errors_px,
-    _without_tip,
-    fitted_background,
-    substrate_background,
-    with_other_fits,
-    with_other_scale,
-)
+from litho_design.judging.measured import _without_tip
 from litho_design.judging.photographs import score_hologram_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer
+from litho_design.scans.background import (
+    _LARGER,
+    fitted_background,
+    print_terms_sd_um,
+    substrate_background,
+)
+from litho_design.scans.dust import foreign_pixels
+from litho_design.scans.placing import Placed, warp_errors_px
+from litho_design.scans.record import MeasuredRecord
+from litho_design.scans.shapes import legendre_shapes
+from litho_design.scans.variants import displaced, with_other_fits, with_other_scale
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
 from tests.litho_design.conftest import unreported
@@ -276,10 +267,10 @@ def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
     type.
     """
     light = np.random.default_rng(0).uniform(0, 1, (100, 100)) ** 2 * 2**bits
-    assert _saturated(np.minimum(light * 1.1, 2**bits - 1).astype(np.uint16)) == pytest.approx(
+    assert saturated_share(np.minimum(light * 1.1, 2**bits - 1).astype(np.uint16)) == pytest.approx(
         0.046, abs=0.01
     )
-    assert _saturated((light * 0.8).astype(np.uint16)) == 0.0
+    assert saturated_share((light * 0.8).astype(np.uint16)) == 0.0
 
 
 def test_a_photograph_that_misses_a_part_of_the_image_has_the_dark_level_of_a_whole_one():
@@ -287,7 +278,8 @@ def test_a_photograph_that_misses_a_part_of_the_image_has_the_dark_level_of_a_wh
     light = np.repeat(np.linspace(0.02, 1, 64, dtype=np.float32)[:, None], 64, axis=1)
     photo = (800 + 20000 * light).astype(np.float32)
     whole, cut = (
-        _dark_level(one, light, _Fit(np.eye(3), 1.0, gain=20000.0)) for one in (photo, photo[:, :60])
+        fitted_dark_level(one, light, CameraFit(np.eye(3), 1.0, gain=20000.0))
+        for one in (photo, photo[:, :60])
     )
     assert cut == pytest.approx(whole)
     # One row of the ramp is 310 counts, and blurs differ in the outermost row.
@@ -304,8 +296,8 @@ def test_dark_gaps_that_are_narrower_than_camera_pixels_do_not_raise_the_dark_le
     averaged = (1 - np.sinc(width / period) * np.cos(2 * np.pi * middles / period)) / 2
     photo = np.repeat((800 + 20000 * averaged)[None].astype(np.float32), 36, axis=0)
     where = np.array([[1 / width, 0, (0.5 - width / 2) / width], [0, 1 / width, (0.5 - width / 2) / width]])
-    fit = _Fit(np.vstack([where, [0, 0, 1]]), 1.0, gain=20000.0, blur_px=width / np.sqrt(12))
-    level, sd = _dark_level(photo, light, fit)
+    fit = CameraFit(np.vstack([where, [0, 0, 1]]), 1.0, gain=20000.0, blur_px=width / np.sqrt(12))
+    level, sd = fitted_dark_level(photo, light, fit)
     # Linear interpolation between camera pixels lowers the contrast to sinc(1 / 4.8)², that is by 14 %.
     assert abs(level - 800) < 0.14 * 20000 / 2
     assert abs(level - 800) < 3 * sd
@@ -341,16 +333,16 @@ def test_the_finest_spot_of_the_light_is_not_replaced_as_a_hot_pixel(middle):
     y, x = np.mgrid[:41, :41]
     v = np.pi * 0.4 * np.hypot(y - 20, x - middle) + 1e-9
     spot = (300 + 30000 * np.square(2 * j1(v) / v)).astype(np.float32)
-    cleaned, replaced = _replace_outliers(spot, 0.4)
+    cleaned, replaced = without_outliers(spot, 0.4)
     assert replaced == 0
     assert np.array_equal(cleaned, spot)
     hot = spot.copy()
     hot[8, 30] = 65535
-    assert _replace_outliers(hot, 0.4)[1] == 1
+    assert without_outliers(hot, 0.4)[1] == 1
     # If the light has no such fine detail, two hot pixels beside each other are found too.
     wide = cv2.GaussianBlur(spot, (0, 0), 3.0)
     wide[8, 30:32] = 65535
-    assert _replace_outliers(wide, 0.1)[1] == 2
+    assert without_outliers(wide, 0.1)[1] == 2
 
 
 class Power(Record):
@@ -409,15 +401,15 @@ def test_dust_is_masked_and_what_the_printer_does_to_all_tall_places_is_not():
     y, x = np.mgrid[:128, :128]
     dust_um = 0.4 * np.exp(-((x - 40) ** 2 + (y - 70) ** 2) / 2 / 4**2)
     valid = np.ones(x.shape, bool)
-    dusty = _defects(noise_um + dust_um, expected_um, valid)
+    dusty = foreign_pixels(noise_um + dust_um, expected_um, valid)
     assert dusty[dust_um > 0.15].all()
     # The dust ends at 0.1 µm, 6.7 px from its middle. The blur and the widening move this edge by 2 px each.
     assert not dusty[np.hypot(x - 40, y - 70) > 6.7 + 4].any()
     tall_um = np.where(expected_um > 0.7, 0.4, 0.0)
-    assert not _defects(noise_um + tall_um, expected_um, valid).any()
+    assert not foreign_pixels(noise_um + tall_um, expected_um, valid).any()
     # A height that occurs only once does not show whether the printer or dust is the cause.
     alone_um = np.where(np.hypot(x - 40, y - 70) < 5, 1.0, expected_um)
-    assert _defects(noise_um + np.where(alone_um == 1, 0.4, 0), alone_um, valid)[70, 40]
+    assert foreign_pixels(noise_um + np.where(alone_um == 1, 0.4, 0), alone_um, valid)[70, 40]
 
 
 def test_the_angle_of_few_spots_is_as_uncertain_as_fits_scatter():
@@ -458,7 +450,9 @@ def test_each_parameter_of_the_registration_is_as_uncertain_as_fits_scatter():
     slope_y, slope_x = np.gradient(topography)
     flows = [(1, 0), (0, 1), (-v, u), (u, v), (u, -v), (v, u)]
     moved = [along_x * slope_x + along_y * slope_y for along_x, along_y in flows]
-    columns = np.stack([*np.moveaxis(_shapes((128, 128), (0, 1, 2)), -1, 0), topography, *moved], axis=-1)
+    columns = np.stack(
+        [*np.moveaxis(legendre_shapes((128, 128), (0, 1, 2)), -1, 0), topography, *moved], axis=-1
+    )
     inside = (slice(8, -8), slice(8, -8))
     found, stated = [], []
     for _ in range(60):
@@ -467,7 +461,7 @@ def test_each_parameter_of_the_registration_is_as_uncertain_as_fits_scatter():
         smooth = cv2.GaussianBlur(height, (0, 0), 1.0)
         fitted, *_ = np.linalg.lstsq(columns[inside].reshape(-1, 13), smooth[inside].ravel(), rcond=None)
         found.append(fitted[-6:] / fitted[-7])
-        stated.append(np.square(_warp_errors_px(height, topography)).sum(0))
+        stated.append(np.square(warp_errors_px(height, topography)).sum(0))
     scatter, sd = np.std(found, axis=0), np.sqrt(np.mean(stated, axis=0))
     assert scatter[1] > 3 * scatter[0]
     # The scatter of 60 fits is known to 9 %, and three times this is allowed. On average, a jackknife does
@@ -486,7 +480,7 @@ def test_an_error_of_the_registration_displaces_a_print_by_its_coefficients():
         (shift_y + turn * u + (size - stretch) * v + slant * u),
     )
     for heights, wanted in zip((x, y), motions, strict=True):
-        assert (_displaced(heights, coefficients) - heights)[16, 60] == pytest.approx(wanted, rel=1e-6)
+        assert (displaced(heights, coefficients) - heights)[16, 60] == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize(("levelling", "terms"), [("none", 0), ("plane", 2), ("bow", 5)])
@@ -526,7 +520,7 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
 TILT, BOW = 1e-3, 1e-5
 
 
-def on_substrate(print_um: np.ndarray, rough_um: np.ndarray | float = 0.0) -> _Placed:
+def on_substrate(print_um: np.ndarray, rough_um: np.ndarray | float = 0.0) -> Placed:
     """Return a scan that shows a print of 64 × 96 px with 12 px of flat substrate around it. The scanner adds
     a tilt, a bow and noise of 2 nm.
     """
@@ -534,7 +528,7 @@ def on_substrate(print_um: np.ndarray, rough_um: np.ndarray | float = 0.0) -> _P
     bent = TILT * x + BOW * (x * x - 2 * y * y)
     noise = 0.002 * np.random.default_rng(2).standard_normal(bent.shape)
     height = np.pad(print_um, 12) + rough_um + bent + noise
-    return _Placed(height, np.isfinite(height), 12)
+    return Placed(height, np.isfinite(height), 12)
 
 
 def test_a_bent_print_is_no_bent_scan_where_the_substrate_is_bare():
@@ -561,13 +555,13 @@ def test_the_standard_deviations_of_the_substrate_fit_hold():
         found.append(substrate_background(on_substrate(flat, rough_um), 0.1, "bow"))
     seen_um = np.std([one.map_um for one in found], axis=0)
     sd_um = np.mean([one.sd_um for one in found], axis=0)
-    stated_um = np.sqrt(_shapes((64, 96), (1, 2)) ** 2 @ sd_um**2)
+    stated_um = np.sqrt(legendre_shapes((64, 96), (1, 2)) ** 2 @ sd_um**2)
     # The terms are correlated a little, and 40 draws know a deviation to 11 %.
     assert 0.6 < np.sqrt(np.mean(seen_um**2) / np.mean(stated_um**2)) < 1.3
 
 
 def test_a_substrate_without_noise_is_used():
-    exact = _Placed(np.pad(np.full((64, 96), 0.4), 12), np.ones((88, 120), bool), 12)
+    exact = Placed(np.pad(np.full((64, 96), 0.4), 12), np.ones((88, 120), bool), 12)
     found = substrate_background(exact, 0.1, "bow")
     assert found is not None
     assert not found.map_um.any()
@@ -596,12 +590,12 @@ def test_a_substrate_that_is_hidden_or_not_flat_is_not_used():
 def test_hidden_tilt_and_bow_are_extrapolated_from_higher_orders():
     generator = np.random.default_rng(0)
     expected_um = generator.uniform(0, 0.8, (96, 128))
-    shapes = _shapes(expected_um.shape, range(1, 7))
+    shapes = legendre_shapes(expected_um.shape, range(1, 7))
     off_um = shapes @ (0.02 * generator.choice([-1, 1], shapes.shape[-1]))
     # On pixels, the terms have an rms of 1.01 to 1.07, not exactly 1.
-    assert _removed_sd_um(off_um, expected_um) == pytest.approx(_LARGER * 0.02, rel=0.1)
+    assert print_terms_sd_um(off_um, expected_um) == pytest.approx(_LARGER * 0.02, rel=0.1)
     # Levelling does not hide what depends on the expected height alone. A group of heights is 0.025 µm wide.
-    assert _removed_sd_um(0.2 * expected_um**2, expected_um) < 1e-4
+    assert print_terms_sd_um(0.2 * expected_um**2, expected_um) < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -644,10 +638,11 @@ def test_a_scale_that_the_stated_pitch_excludes_is_not_fitted():
     copy = cv2.warpAffine(wanted, smaller, (128, 128), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     moves_px2 = np.zeros((6, 6))
     moves_px2[3, 3] = (0.015 * 64) ** 2
-    fit = _fit(0.35 * wanted + 0.65 * copy, wanted, 1.0, 0.02, moves_px2)
-    # The fitted scale is that of the camera (standard deviation 0.02) times that of the print (0.015), so its
-    # own standard deviation is 0.025. A fit that ignores this shrinks the image by 11 %.
-    assert abs(fit.steps_px[3] / 64) < 2 * 0.025
+    warp = fit_camera(0.35 * wanted + 0.65 * copy, wanted, 1.0, 0.02, moves_px2).window_to_photo
+    pixels = np.linalg.det(warp) / (warp[2] @ [63.5, 63.5, 1]) ** 3
+    # The scale of the camera has a standard deviation of 0.02. Without this prior in the fit, the image would
+    # be shrunk by 11 %, of which at least 0.02² / (0.02² + 0.015²), 7 %, would be the camera's.
+    assert abs(np.log(pixels) / 2) < 2 * 0.02
 
 
 def test_another_scale_of_the_camera_does_not_change_the_light():

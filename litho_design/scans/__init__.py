@@ -1,0 +1,1 @@
+"""Register AFM scans of printed elements, level them, and find dust on them."""
