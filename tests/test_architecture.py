@@ -36,7 +36,7 @@ ROOMS = {
         "boards", "cli",
     ),
     "litho_design": (
-        "optics", "images", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",
+        "optics", "images", "scans", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",
         "large", "judging", "exports", "reports", "workflows", "sheets", "cli",
     ),
 }  # fmt: skip
