@@ -36,8 +36,8 @@ ROOMS = {
         "boards", "cli",
     ),
     "litho_design": (
-        "optics", "images", "scans", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",
-        "large", "judging", "exports", "reports", "workflows", "sheets", "cli",
+        "optics", "images", "scans", "printers", "optimisation", "elements", "tasks", "holograms", "lenses",
+        "reliefs", "large", "judging", "exports", "reports", "workflows", "sheets", "cli",
     ),
 }  # fmt: skip
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
