@@ -4,7 +4,6 @@ scores.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
@@ -20,6 +19,13 @@ DRAWS = 8
 # Number of tiles along each side of a map from which the covariance of a fit is computed. Errors of
 # the expected map extend over several features, so each tile must contain many features.
 _TILES = 4
+# Number of random errors from which a standard deviation is computed.
+_POSSIBLE = 20_000
+# Shares of the possible scores that lie within one and within three standard deviations. A normal
+# distribution has 0.6827 and 0.9973. Of skewed errors, 0.9973 would make one standard deviation too wide.
+_WITHIN_1, _WITHIN_3 = 0.6827, 0.995
+# A standard deviation may be larger than necessary by this factor if the score lies closer to the mean.
+_NEAR_MEAN = 1.05
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
@@ -89,39 +95,66 @@ def estimated(
     score: Callable[[T], Record],
     measured: Record,
     noisier: Iterable[T],
-    left: Iterable[T],
-    hidden: Iterable[T],
+    others: Iterable[T],
+    either: Iterable[T] = (),
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Correct the scores of a measurement for its errors. Return two dicts, keyed by the name of the score:
     the corrected scores, and their standard deviations.
 
-    Errors that remain in a measurement bias its scores. The same kinds of errors are therefore added once
-    more. This changes a score, on average, by the same bias, which is then subtracted (bias correction by
-    bootstrap, Efron and Tibshirani 1993, chapter 10). Other errors are hidden by a fit, such as levelling:
-    the fit makes the print look more like the expected print than it is. For each pair in ``hidden``, the
-    mean change of a score is therefore added.
-
-    The variants come in pairs. The two variants of a pair contain the same error with opposite signs. In
-    ``left`` and ``hidden``, each pair changes one independent parameter by its standard deviation. If the
-    parameters are normally distributed and the score is a sum of quadratic functions of single parameters,
-    the mean and the variance are exact (JCGM 100:2008, 5.1.2).
+    Noise biases a score. It is therefore added once more. This changes the score, on average, by the same
+    bias, which is then subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10).
+    Scale, levelling and registration of the measurement may be wrong, so the true print or image may be one
+    of its variants. From them, possible true scores are drawn (JCGM 101:2008): the parameters are normally
+    distributed, and the score is a sum of quadratic functions of single parameters. An error of position only
+    ever lowers a score, so the possible scores are skewed, and their standard deviation would not cover them
+    as that of a normal distribution does. The returned standard deviation does (see ``_covering``).
 
     Args:
         score: function that scores a variant.
         measured: scores of the measurement.
         noisier: pairs of variants with added random noise, which is as strong as the noise of the
-            measurement.
-        left: pairs of variants with added errors of the kinds that remain in the measurement.
-        hidden: pairs of variants that the fit cannot distinguish from the measurement.
+            measurement. The two variants of a pair contain the same noise with opposite signs.
+        others: pairs of variants. The two variants of a pair differ from the measurement in one independent
+            parameter, by plus and minus its standard deviation.
+        either: pairs of variants of which one is true, each with the same probability.
     """
-    noise, rest, fitted = (_changes(score, measured, variants) for variants in (noisier, left, hidden))
+    noise, free, doubted = (_changes(score, measured, variants) for variants in (noisier, others, either))
     figures, spread = {}, {}
-    for name in noise:
-        (even_left, odd_left), (even, odd) = _parts(rest[name]), _parts(fitted[name])
-        figures[name] = getattr(measured, name) - float(noise[name].mean() + even_left.sum() - even.sum())
-        squares = np.concatenate([odd_left, odd]) ** 2 + 2 * np.concatenate([even_left, even]) ** 2
-        spread[name] = math.sqrt(noise[name].var() + squares.sum())
+    for name, added in noise.items():
+        generator = np.random.default_rng(0)
+        possible = _drawn(added.std() * np.array([1, -1]), generator) + _drawn(free[name], generator)
+        possible += _drawn(doubted[name], generator, two_valued=True)
+        figures[name], spread[name] = _covering(getattr(measured, name) - added.mean() + possible)
     return figures, spread
+
+
+def _drawn(changes: np.ndarray, generator: np.random.Generator, *, two_valued: bool = False) -> np.ndarray:
+    """Draw sums of the changes that pairs of variants cause, shape (_POSSIBLE,). ``changes`` is as in
+    ``_parts``. Each parameter is normally distributed or, if ``two_valued``, one of the two variants is true.
+    Every draw occurs with both signs, so the mean of odd changes is exactly 0.
+    """
+    even, odd = _parts(changes)
+    half = generator.standard_normal((_POSSIBLE // 2, len(even)))
+    amounts = np.concatenate([half, -half])
+    if two_valued:
+        amounts = np.sign(amounts)
+    drawn: np.ndarray = amounts @ odd + amounts**2 @ even
+    return drawn
+
+
+def _covering(values: np.ndarray) -> tuple[float, float]:
+    """Return the centre and the half width σ of the narrowest interval that contains the share ``_WITHIN_1``
+    of the values, while the interval of three times its width contains the share ``_WITHIN_3``.
+
+    Of the centres whose σ is hardly above the smallest one (see ``_NEAR_MEAN``), the one closest to the mean
+    is returned.
+    """
+    mean, sd = float(values.mean()), float(values.std())
+    centres = mean + sd * np.array(sorted(np.linspace(-1, 1, 41), key=abs))
+    inner, outer = np.quantile(np.abs(values - centres[:, None]), [_WITHIN_1, _WITHIN_3], axis=1)
+    widths = np.maximum(inner, outer / 3)
+    best = int(np.argmax(widths <= _NEAR_MEAN * widths.min()))
+    return float(centres[best]), float(widths[best])
 
 
 def _changes(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, np.ndarray]:

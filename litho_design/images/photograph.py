@@ -143,18 +143,14 @@ class Photograph:
             for sign in (1, -1):
                 yield self._warped((self.counts + sign * noise).astype(np.float32), self.window_to_photo)
 
-    def with_other_faults(self) -> Iterator[np.ndarray]:
-        """Yield the pair of images in which the vignetting of the camera differs by plus and minus its
-        standard deviation. Nothing is yielded if a flat field was given.
-        """
-        for sign in (1, -1) if self.record.vignetting_sd else ():
-            yield self._warped(self.counts, self.window_to_photo, sign * self.record.vignetting_sd)
-
-    def with_other_fits(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images in which one fitted property of the camera differs by plus and minus its
-        standard deviation. The properties are the independent movements of the camera and the dark level.
+    def with_other_cameras(self) -> Iterator[np.ndarray]:
+        """Yield pairs of images in which one property of the camera differs by plus and minus its standard
+        deviation. The properties are the independent movements of the camera and, unless they are known, the
+        vignetting and the dark level.
         """
         yield from (self._warped(self.counts, warp) for pair in self.other_warps for warp in pair)
+        for sign in (1, -1) if self.record.vignetting_sd else ():
+            yield self._warped(self.counts, self.window_to_photo, sign * self.record.vignetting_sd)
         for sign in (1, -1) if self.record.dark_level_sd else ():
             darker = self.counts - np.float32(sign * self.record.dark_level_sd)
             yield self._warped(darker, self.window_to_photo)

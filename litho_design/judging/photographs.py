@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from litho_design.optics.imaging import Blur, richardson_lucy
 # Largest accepted standard deviation of the SI-PSNR, in dB. With a larger standard deviation, a score cannot
 # decide between designs.
 _LARGEST_SD_DB = 0.5
-# Relative standard deviation of the effect that a blur of the camera has on a score.
+# Standard deviation of the unknown part of a photograph's blur, as a share of the whole blur.
 _BLUR_SD = 0.2
 
 
@@ -109,16 +109,12 @@ def score_hologram_photo(
         return photo_score(share, target, resolved, has_power=power is not None)
 
     image = photo.image()
-    variants = photo.with_more_noise(), photo.with_other_faults(), photo.with_other_fits()
-    freed, uncertainty = estimated(figures, figures(image), *variants)
-    # If the photograph is blurrier than the expected image, the cause may be the camera or the print. Part of
-    # the effect of this blur on the score is therefore added to the uncertainty.
-    sharp, soft = (
-        photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
-        for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))
-    )
-    for name, value in sharp.items():
-        uncertainty[name] = math.hypot(uncertainty[name], _BLUR_SD * (soft[name] - value))
+    # If the photograph is blurrier than the expected image, the cause may be the camera or the print. The
+    # photograph may therefore be a little sharper or blurrier than it should be.
+    blur_px = photo.record.blur_um / loaded.record.layout.pitch_um
+    blurred = _BLUR_SD * (gaussian_filter(photo.expected, blur_px) - photo.expected)
+    variants = chain(photo.with_other_cameras(), (image + blurred, image - blurred))
+    freed, uncertainty = estimated(figures, figures(image), photo.with_more_noise(), variants)
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
@@ -204,7 +200,7 @@ def score_lens_photo(
     pictures = {f"object {object_name(which)}": wanted}
     for name, estimate in estimates(image).items():
         pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = estimate
-    variants = photo.with_more_noise(), photo.with_other_faults(), photo.with_other_fits()
+    variants = photo.with_more_noise(), photo.with_other_cameras()
     freed, uncertainty = estimated(figures, figures(image), *variants)
     return PhotoVerdict(
         LensPhotoScore(**freed),

@@ -28,7 +28,7 @@ from litho_design.optics import Optics
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 from litho_design.scans.record import MeasuredRecord
-from litho_design.scans.variants import with_more_noise, with_other_fits, with_other_scale
+from litho_design.scans.variants import with_dust, with_more_noise, with_other_prints
 from litho_design.tasks.design import Design
 
 
@@ -195,9 +195,8 @@ def _print_score(
     measured = doubt_um is not None
     if isinstance(judge, MeasuredRecord) and doubt_um is not None:
         pitch_um = loaded.record.layout.pitch_um
-        left = with_other_scale(height, judge, pitch_um)
-        hidden = with_other_fits(height, judge, pitch_um, doubt_um)
-        figures, spread = estimated(loaded.score, scored, with_more_noise(height, judge), left, hidden)
+        noisier, others = with_more_noise(height, judge), with_other_prints(height, judge, pitch_um)
+        figures, spread = estimated(loaded.score, scored, noisier, others, with_dust(height, doubt_um))
     off = (height - loaded.expected_um).double()
     in_rings = loaded.record.in_rings
     area = loaded.bench.propagator.ring_area_um2.to(off) if in_rings else torch.ones_like(off)

@@ -30,9 +30,14 @@ def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tenso
         yield from _pair(record.noise_um * generator.standard_normal(height_um.shape), height_um)
 
 
-def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, in which the height scale or the effect of the tip
-    differs by plus and minus its standard deviation.
+def with_other_prints(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
+    """Yield pairs of prints of shape (ny, nx), in µm, any of which may be the true print. The two prints of a
+    pair differ from the measured print in one quantity: by plus its standard deviation in the first, and by
+    minus it in the second.
+
+    This quantity is the height scale of the scan, the effect of the tip, a term of the print's own tilt and
+    bow, a factor common to all these terms (unless they were measured on the substrate), or an error of the
+    registration.
     """
     from litho_data.tip import paraboloid_erosion
 
@@ -41,18 +46,6 @@ def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float)
     if record.tip_um:
         narrower = paraboloid_erosion(measured, (pitch_um, pitch_um), record.tip_um).surface
         yield from _pair(_TIP_SD * (narrower - measured), height_um)
-
-
-def with_other_fits(
-    height_um: Tensor, record: MeasuredRecord, pitch_um: float, doubt_um: Tensor
-) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, that the processing of the scan cannot distinguish from
-    the measured print. The two prints of a pair differ from the measured print in one quantity: by plus its
-    standard deviation in the first, and by minus it in the second. This quantity is a term of the print's own
-    tilt and bow, a factor common to all these terms (unless they were measured on the substrate), or an error
-    of the registration. In the last pair, all or none of ``doubt_um`` belongs to the print instead of dust.
-    """
-    measured = height_um.double().cpu().numpy()
     removed = legendre_shapes(measured.shape, FITTED_ORDERS[record.levelling])
     for shape, sd_um in zip(np.moveaxis(removed, -1, 0), record.removed_sd_um, strict=False):
         yield from _pair(sd_um * shape, height_um)
@@ -62,9 +55,11 @@ def with_other_fits(
         for sign in (1, -1):
             motion_px = sign * np.array(error_um) / pitch_um
             yield torch.from_numpy(displaced(measured, motion_px)).to(height_um)
+
+
+def with_dust(height_um: Tensor, doubt_um: Tensor) -> Iterator[Tensor]:
+    """Yield the print with and without ``doubt_um``, in µm, which may be print or dust, unless it is zero."""
     if doubt_um.any():
-        # The deviation may be dust or print with equal probability, so the score is corrected by half of its
-        # effect.
         yield from (height_um + doubt_um, height_um)
 
 

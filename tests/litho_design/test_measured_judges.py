@@ -39,7 +39,7 @@ from litho_design.scans.dust import foreign_pixels
 from litho_design.scans.placing import Placed, warp_errors_px
 from litho_design.scans.record import MeasuredRecord
 from litho_design.scans.shapes import legendre_shapes
-from litho_design.scans.variants import displaced, with_other_fits, with_other_scale
+from litho_design.scans.variants import displaced, with_dust, with_other_prints
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
 from tests.litho_design.conftest import unreported
@@ -365,7 +365,7 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
         pairs = [seen + sign * one for one in noise for sign in (1, -1)]
         measured = Power(mean=seen.mean(), power=np.square(seen).mean())
         figures, spread = estimated(
-            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs, [], []
+            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs, []
         )
         assert figures["mean"] == pytest.approx(measured.mean, abs=1e-12)
         drawn.append(measured.power)
@@ -377,21 +377,42 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
     assert spread["mean"] == pytest.approx(sd / np.sqrt(4000), rel=0.8)
 
 
-def test_the_effect_of_what_a_fit_hides_is_added_and_that_of_what_it_left_is_subtracted():
-    """Check two independent shifts with the standard deviations s and t. They add s^2 + t^2 to a square."""
-    pairs = [sign * shift * np.eye(2)[axis] for axis, shift in enumerate((0.3, 0.4)) for sign in (1, -1)]
+@pytest.mark.parametrize("curved", [0.0, 1.0, 5.0, -5.0])
+def test_sigma_covers_linear_and_curved_errors(curved):
+    """Check a score that is a quadratic function of two errors with the standard deviations 0.3 and 0.4. An
+    independent sample of errors lies within one and three σ as often as a normal distribution, or more often.
+    """
+    shifts, start = np.diag([0.3, 0.4]), np.zeros(2)
 
+    def power(errors: np.ndarray) -> np.ndarray:
+        return errors.sum(-1) + curved * np.square(errors).sum(-1)
+
+    def score(errors: np.ndarray) -> Power:
+        return Power(mean=errors.sum(), power=power(errors))
+
+    pairs = [sign * shift for shift in shifts for sign in (1, -1)]
+    figures, spread = estimated(score, score(start), [start] * 2, pairs)
+    assert figures["mean"] == pytest.approx(0, abs=1e-12)
+    # 20,000 draws show σ to 0.7 %.
+    assert spread["mean"] == pytest.approx(0.5, rel=0.03)
+    drawn = power(np.random.default_rng(1).standard_normal((100_000, 2)) @ shifts)
+    off = np.abs(drawn - figures["power"]) / spread["power"]
+    # The shares are known to 0.3 and 0.1 %. Three σ of strongly curved errors require a wide σ.
+    assert 0.67 < np.mean(off < 1) < 0.92
+    assert np.mean(off < 3) > 0.993
+    # The usual σ of strongly curved errors covers 98.2 %.
+    usual = np.abs(drawn - drawn.mean()) / drawn.std()
+    assert abs(curved) < 5 or np.mean(usual < 3) < 0.985
+
+
+def test_two_possibilities_lie_one_sigma_from_their_mean():
     def score(one: np.ndarray) -> Power:
-        return Power(mean=one.mean(), power=np.square(one).sum())
+        return Power(mean=one[0], power=np.square(one).sum())
 
-    for left, hidden, sign in ((pairs, [], -1), ([], pairs, 1), (pairs[:2], pairs[2:], None)):
-        figures, spread = estimated(score, score(np.zeros(2)), [np.zeros(2)], left, hidden)
-        wanted = sign * (0.3**2 + 0.4**2) if sign else 0.4**2 - 0.3**2
-        assert figures["power"] == pytest.approx(wanted)
-        assert figures["mean"] == pytest.approx(0, abs=1e-12)
-        assert spread["mean"] == pytest.approx(np.hypot(0.3, 0.4) / 2)
-        # The variance of the square of a normally distributed number is twice the square of its variance.
-        assert spread["power"] == pytest.approx(np.sqrt(2 * (0.3**4 + 0.4**4)))
+    start = np.zeros(1)
+    figures, spread = estimated(score, score(start), [start] * 2, [], [np.array([0.4]), start])
+    assert figures == pytest.approx({"mean": 0.2, "power": 0.08})
+    assert spread == pytest.approx({"mean": 0.2, "power": 0.08})
 
 
 def test_dust_is_masked_and_what_the_printer_does_to_all_tall_places_is_not():
@@ -491,12 +512,14 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     record = MeasuredRecord.model_construct(levelling=levelling, removed_sd_um=removed_sd_um, **facts)
     doubt_um = torch.zeros_like(height_um)
     doubt_um[10:14, 20:24] = 0.3
-    *pairs, whole, none = with_other_fits(height_um, record, 0.1, doubt_um)
     # All or none of the doubtful height belongs to the print.
+    whole, none = with_dust(height_um, doubt_um)
     assert torch.allclose(whole - height_um, doubt_um)
     assert torch.equal(none, height_um)
-    certain = with_other_fits(height_um, record, 0.1, torch.zeros_like(height_um))
-    assert len(list(certain)) == len(pairs)
+    assert not list(with_dust(height_um, torch.zeros_like(height_um)))
+    more, less, *pairs = with_other_prints(height_um, record, 0.1)
+    assert torch.allclose(more, 1.02 * height_um)
+    assert torch.allclose(more + less, 2 * height_um)
     changes = torch.stack([one - height_um for one in pairs])
     plus, minus = changes.reshape(-1, 2, *height_um.shape).unbind(1)
     # The terms of tilt and bow, their common factor, and the six parameters of the registration.
@@ -511,9 +534,6 @@ def test_prints_that_a_fit_cannot_distinguish_come_in_pairs(levelling, terms):
     slope, shift_px = 0.8 / 95, 0.05 / 0.1
     assert plus[-6][inside[1:]].numpy() == pytest.approx(slope * shift_px, rel=1e-3)
     assert plus[-5][inside[1:]].abs().max() == pytest.approx(0, abs=1e-6)
-    (more, less) = with_other_scale(height_um, record, 0.1)
-    assert torch.allclose(more, 1.02 * height_um)
-    assert torch.allclose(more + less, 2 * height_um)
 
 
 # Tilt, µm per pixel, and bow, µm per squared pixel.
@@ -650,10 +670,10 @@ def test_another_scale_of_the_camera_does_not_change_the_light():
     counts = np.exp(-(x**2 + y**2) / 2 / 12**2).astype(np.float32)
     where = np.array([[1.5, 0, 4], [0, 1.5, 4], [0, 0, 1]])
     larger = np.array([[1.6, 0, -2.5], [0, 1.6, -2.5], [0, 0, 1]])
-    facts = {"pitch_um": 0.1, "dark_level_sd": 0.0}
+    facts = {"pitch_um": 0.1, "dark_level_sd": 0.0, "vignetting_sd": 0.0}
     record, warps = CameraRecord.model_construct(**facts), [[larger] * 2]
     photo = Photograph(counts, where, 128, 0.15, 1.0, 0.0, record, np.zeros((128, 128)), warps)
-    light = [photo.power_share(image, 1.0).sum() for image in (photo.image(), *photo.with_other_fits())]
+    light = [photo.power_share(image, 1.0).sum() for image in (photo.image(), *photo.with_other_cameras())]
     # Interpolation changes the light by less than 0.1 %, and the scale by 14 % if it is not corrected.
     assert light == pytest.approx([counts.sum()] * 3, rel=1e-3)
 
