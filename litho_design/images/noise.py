@@ -25,7 +25,7 @@ _POSSIBLE = 20_000
 # distribution has 0.6827 and 0.9973. Of skewed errors, 0.9973 would make one standard deviation too wide.
 _WITHIN_1, _WITHIN_3 = 0.6827, 0.995
 # A standard deviation may be larger than necessary by this factor if the score lies closer to the mean.
-_NEAR_MEAN = 1.05
+_NEAR_MEAN = 1.03
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
