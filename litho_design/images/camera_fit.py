@@ -15,6 +15,11 @@ from litho_design.images.camera_pose import Images, blurred_images, tilted_pose
 # does not show. These are typical standard deviations of the shifts, the rotation, the scale and the tilts,
 # as shares of half the window (rms over twenty holograms and five models, less the scatter between tiles).
 _PRINT_MOVES_SD = np.array([0.004, 0.004, 0.0, 0.015, 0.0, 0.0])
+# The dark level is found from pixels at these percentiles of brightness. The second one gives its value, and
+# their spread its error.
+_DARK_PERCENTS = (1, 3, 10)
+# Relative standard deviation of the expected light in the darkest pixels.
+_DARK_LIGHT_SD = 0.3
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,8 @@ def fit_camera(
     """
     images = blurred_images(photo, expected, scale)
     unit = images.unit
-    # Without the prior of the scale, a print whose image resembles the expected one little may fit best at a
-    # wrong scale.
+    # Without a prior of the scale, a print whose image resembles the expected one little may fit best at a
+    # wrong scale. If the image shows its scale well, the prior hardly changes the fit.
     prior_sd = math.hypot(scale_sd, math.sqrt(moves_px2[3, 3]) * unit[3]) if scale_sd else 0.0
     pose, free, scatter_px2 = tilted_pose(images, scale_sd, prior_sd)
     spread = scatter_px2[np.ix_(free, free)] + moves_px2[np.ix_(free, free)]
@@ -111,16 +116,15 @@ def fitted_dark_level(photo: np.ndarray, expected: np.ndarray, fit: CameraFit) -
 
     way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
     seen: Any = cv2.warpPerspective(photo, fit.window_to_photo, expected.shape, **way)
-    # Noise is averaged over three camera pixels. The expected image must be averaged over the same area,
-    # because its dark gaps may be as narrow.
+    # The blur is as wide as a mean over 3 × 3 camera pixels. The expected image must be averaged over the same
+    # area, because its dark gaps may be as narrow.
     averaged_px = math.sqrt(2 / 3 / abs(np.linalg.det(fit.window_to_photo)))
     seen = cv2.GaussianBlur(seen, (0, 0), averaged_px)
     blurred = cv2.GaussianBlur(expected, (0, 0), math.hypot(averaged_px, max(fit.blur_px, 0.5)))
     inside = inside_photograph(fit.window_to_photo, photo.shape, len(expected))
-    shares = [1, 3, 10]
-    found, wanted = (np.percentile(one[inside], shares) for one in (seen, blurred))
+    found, wanted = (np.percentile(one[inside], _DARK_PERCENTS) for one in (seen, blurred))
     levels = found - fit.gain * wanted
-    return float(levels[1]), float(np.ptp(levels)) / 2 + 0.3 * fit.gain * float(wanted[1])
+    return float(levels[1]), float(np.ptp(levels)) / 2 + _DARK_LIGHT_SD * fit.gain * float(wanted[1])
 
 
 def inside_photograph(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:

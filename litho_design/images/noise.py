@@ -1,4 +1,4 @@
-"""Estimate the white noise of a measured map, the covariance of a fit to it, and the uncertainty of its
+"""Estimate the white noise of a measured map, the covariance of a fit to it, and the uncertainties of its
 scores.
 """
 
@@ -19,14 +19,15 @@ DRAWS = 8
 # Number of tiles along each side of a map from which the covariance of a fit is computed. Errors of
 # the expected map extend over several features, so each tile must contain many features.
 _TILES = 4
-# Number of random errors from which a standard deviation is computed.
+# Number of random errors from which the uncertainty of a score is computed.
 _POSSIBLE = 20_000
-# Shares of the possible scores that lie within one and within three standard deviations. A normal
-# distribution has 0.6827 and 0.9973. Of skewed errors, 0.9973 would make one standard deviation too wide.
+# Shares of the possible scores that lie within 1 σ and within 3 σ. For a normal distribution, these shares
+# are 0.6827 and 0.9973. With 0.9973, σ would be too wide for skewed scores.
 _WITHIN_1, _WITHIN_3 = 0.6827, 0.995
-# A standard deviation may be larger than necessary by this factor if the score lies closer to the mean.
+# σ may be larger than necessary by this factor if the score then lies closer to the mean of all possible
+# scores.
 _NEAR_MEAN = 1.03
-# Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
+# Beyond this frequency (cycles/px) along both axes, neither prints nor sharply sampled images have structure.
 _NOISE_BAND = 0.35
 
 
@@ -91,55 +92,46 @@ def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     return np.outer(*map(np.hanning, shape)), np.logical_and.outer(*along)
 
 
-def estimated(
+def corrected_scores(
     score: Callable[[T], Record],
     measured: Record,
-    noisier: Iterable[T],
-    others: Iterable[T],
-    either: Iterable[T] = (),
+    noisy: Iterable[T],
+    variants: Iterable[T],
+    alternatives: Iterable[T] = (),
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Correct the scores of a measurement for its errors. Return two dicts, keyed by the name of the score:
-    the corrected scores, and their standard deviations.
+    """Return the corrected scores of a measurement and their uncertainties σ, two dicts keyed by the name of
+    the score.
 
-    Noise biases a score. It is therefore added once more. This changes the score, on average, by the same
-    bias, which is then subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10).
-    Scale, levelling and registration of the measurement may be wrong, so the true print or image may be one
-    of its variants. From them, possible true scores are drawn (JCGM 101:2008): the parameters are normally
-    distributed, and the score is a sum of quadratic functions of single parameters. An error of position only
-    ever lowers a score, so the possible scores are skewed, and their standard deviation would not cover them
-    as that of a normal distribution does. The returned standard deviation does (see ``_covering``).
+    Noise biases a score. Noise of the same strength is therefore added once more, and the mean change is
+    subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Other quantities, such
+    as the scale, may be wrong by a known standard deviation. Random errors of them are drawn (JCGM 101:2008),
+    and each draw gives one possible true score. The change of a score is assumed to be a sum of quadratic
+    functions, one per quantity. An error of position usually makes a score worse, whatever its sign, so the
+    possible scores are skewed. Score and σ are chosen so that 68 % of them lie within 1 σ, and 99.5 % within
+    3 σ.
 
     Args:
-        score: function that scores a variant.
+        score: function that scores an image or a print.
         measured: scores of the measurement.
-        noisier: pairs of variants with added random noise, which is as strong as the noise of the
-            measurement. The two variants of a pair contain the same noise with opposite signs.
-        others: pairs of variants. The two variants of a pair differ from the measurement in one independent
-            parameter, by plus and minus its standard deviation.
-        either: pairs of variants of which one is true, each with the same probability.
+        noisy: pairs of measurements with added random noise. The two measurements of a pair contain the same
+            noise with opposite signs.
+        variants: pairs of measurements that differ from the given one in one independent quantity, by plus
+            and minus its standard deviation.
+        alternatives: pairs of measurements of which one is right, each with the same probability.
     """
-    noise, free, doubted = (_changes(score, measured, variants) for variants in (noisier, others, either))
-    figures, spread = {}, {}
+    noise, free, either = (_changes(score, measured, one) for one in (noisy, variants, alternatives))
+    figures, sigma = {}, {}
     for name, added in noise.items():
-        generator = np.random.default_rng(0)
-        possible = _drawn(added.std() * np.array([1, -1]), generator) + _drawn(free[name], generator)
-        possible += _drawn(doubted[name], generator, two_valued=True)
-        figures[name], spread[name] = _covering(getattr(measured, name) - added.mean() + possible)
-    return figures, spread
-
-
-def _drawn(changes: np.ndarray, generator: np.random.Generator, *, two_valued: bool = False) -> np.ndarray:
-    """Draw sums of the changes that pairs of variants cause, shape (_POSSIBLE,). ``changes`` is as in
-    ``_parts``. Each parameter is normally distributed or, if ``two_valued``, one of the two variants is true.
-    Every draw occurs with both signs, so the mean of odd changes is exactly 0.
-    """
-    even, odd = _parts(changes)
-    half = generator.standard_normal((_POSSIBLE // 2, len(even)))
-    amounts = np.concatenate([half, -half])
-    if two_valued:
-        amounts = np.sign(amounts)
-    drawn: np.ndarray = amounts @ odd + amounts**2 @ even
-    return drawn
+        even, odd = _parts(np.concatenate([free[name], either[name]]))
+        half = np.random.default_rng(0).standard_normal((_POSSIBLE // 2, 1 + len(odd)))
+        # Every draw is used with both signs, so that odd changes cancel in the mean.
+        amounts = np.concatenate([half, -half])
+        two_valued = amounts[:, 1 + len(free[name]) // 2 :]
+        two_valued[:] = np.sign(two_valued)
+        possible = getattr(measured, name) - added.mean() + added.std() * amounts[:, 0]
+        possible += amounts[:, 1:] @ odd + amounts[:, 1:] ** 2 @ even
+        figures[name], sigma[name] = _covering(possible)
+    return figures, sigma
 
 
 def _covering(values: np.ndarray) -> tuple[float, float]:

@@ -157,7 +157,7 @@ class Photograph:
 
     def _camera_pixels(self, warp: np.ndarray) -> float:
         """Return the number of camera pixels per window pixel in the middle of the window."""
-        middle = np.array([self.side_px / 2, self.side_px / 2, 1])
+        middle = np.array([(self.side_px - 1) / 2, (self.side_px - 1) / 2, 1])
         return float(abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3))
 
     def _warped(self, counts: np.ndarray, warp: np.ndarray, vignetting: float = 0.0) -> np.ndarray:

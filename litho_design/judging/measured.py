@@ -16,7 +16,12 @@ from litho_data.scan import Scan
 from litho_design.images.measurements import Levelling, MeasuredSource
 from litho_design.images.noise import white_noise
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.scans.background import fitted_background, print_terms_sd_um, substrate_background
+from litho_design.scans.background import (
+    FITTED_ORDERS,
+    fitted_background,
+    print_terms_sd_um,
+    substrate_background,
+)
 from litho_design.scans.dust import foreign_pixels
 from litho_design.scans.placing import as_it_lies, registered
 from litho_design.scans.record import MeasuredRecord
@@ -66,18 +71,13 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     placed = place(scan, loaded.level.cpu().numpy(), layout.pitch_um)
     height, valid = (placed.inner(one) for one in (placed.height_um, placed.valid))
     coverage = float(valid.mean())
-    if coverage < _SMALLEST_COVERAGE:
-        raise InputError(
-            f"scan {source.path}",
-            got=f"{100 * coverage:.0f} % of the element",
-            wanted=f"at least {100 * _SMALLEST_COVERAGE:.0f} %",
-            hint="a hologram needs its whole area; stitch the scans first",
-        )
+    _check_coverage(source, coverage, "a hologram needs its whole area; stitch the scans first")
     expected = loaded.expected_um.cpu().numpy()
     bare = substrate_background(placed, layout.pitch_um, source.levelling)
     background = bare or fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     defects = foreign_pixels(np.where(valid, height - background.map_um - expected, 0.0), expected, valid)
     valid = valid & ~defects
+    _check_coverage(source, float(valid.mean()), "clean the sample; dust and scars cover the rest")
     background = bare or fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     levelled = height - background.map_um
     ncc = float(np.corrcoef(levelled[valid], expected[valid])[0, 1])
@@ -93,6 +93,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     # Up to the nominal height of the highest level, the print itself may be what looks like dust.
     plausible = np.clip(levelled - offset, 0, (layout.levels - 1) * layout.level_height_um)
     doubt = np.where(defects, plausible - expected, 0.0).astype(np.float32)
+    terms = sum(order + 1 for order in FITTED_ORDERS[source.levelling])
+    removed_sd_um = bare.sd_um if bare else [print_terms_sd_um(complete - expected, expected)] * terms
     record = MeasuredRecord(
         name=Path(source.path).name,
         sha256=file_sha256(source.path),
@@ -106,8 +108,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         levelled_on="substrate" if bare else "print",
         tilt_um_per_um=background.tilt_um_per_um,
         bow_um=background.bow_um,
-        removed_sd_um=bare.sd_um if bare else [print_terms_sd_um(complete - expected, expected)] * 5,
-        noise_um=white_noise(complete - expected),
+        removed_sd_um=removed_sd_um,
+        noise_um=placed.noise_factor * white_noise(complete - expected),
         warp_errors_um=(layout.pitch_um * placed.warp_errors_px).tolist(),
         scale_sd=source.scale_sd,
         defect_share=float(defects.mean()),
@@ -115,6 +117,16 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         tip_change_um=tip_change_um,
     )
     return torch.from_numpy(complete).to(loaded.device), record, torch.from_numpy(doubt).to(loaded.device)
+
+
+def _check_coverage(source: MeasuredSource, share: float, hint: str) -> None:
+    if share < _SMALLEST_COVERAGE:
+        raise InputError(
+            f"scan {source.path}",
+            got=f"{100 * share:.0f} % of the element",
+            wanted=f"at least {100 * _SMALLEST_COVERAGE:.0f} %",
+            hint=hint,
+        )
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.measurements import PhotoSource
-from litho_design.images.noise import estimated
+from litho_design.images.noise import corrected_scores
 from litho_design.images.photo_registration import photographed_image
 from litho_design.images.photograph import CameraRecord, Photograph
 from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
@@ -27,8 +27,7 @@ from litho_design.lenses.objects import read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 
-# Largest accepted standard deviation of the SI-PSNR, in dB. With a larger standard deviation, a score cannot
-# decide between designs.
+# Largest accepted σ of the SI-PSNR, in dB. With a larger σ, a score cannot decide between designs.
 _LARGEST_SD_DB = 0.5
 # Standard deviation of the unknown part of a photograph's blur, as a share of the whole blur.
 _BLUR_SD = 0.2
@@ -114,16 +113,16 @@ def score_hologram_photo(
     blur_px = photo.record.blur_um / loaded.record.layout.pitch_um
     blurred = _BLUR_SD * (gaussian_filter(photo.expected, blur_px) - photo.expected)
     variants = chain(photo.with_other_cameras(), (image + blurred, image - blurred))
-    freed, uncertainty = estimated(figures, figures(image), photo.with_more_noise(), variants)
-    if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
+    corrected, sigma = corrected_scores(figures, figures(image), photo.with_more_noise(), variants)
+    if not sigma["si_psnr_db"] <= _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
-            got=f"an uncertainty of {uncertainty['si_psnr_db']:.2f} dB in SI-PSNR",
+            got=f"an uncertainty of {sigma['si_psnr_db']:.2f} dB in SI-PSNR",
             wanted=f"at most {_LARGEST_SD_DB} dB",
             hint="use a longer exposure or the mean of several exposures, and give --camera-dark-level",
         )
     pictures = {f"photograph {photo.record.name}": image.clip(0)}
-    return PhotoVerdict(PhotoScore(**freed), uncertainty, photo.record, pictures)
+    return PhotoVerdict(PhotoScore(**corrected), sigma, photo.record, pictures)
 
 
 def _registered(
@@ -186,9 +185,7 @@ def score_lens_photo(
         seen = torch.from_numpy(image).to(expected).clamp(min=0)
         seen = seen * matched_scale(seen, expected)
         found = {name: richardson_lucy(seen, kernel, settings.iterations) for name, kernel in kernels.items()}
-        return {
-            name: image * matched_scale(image, wanted) for name, image in ({"direct": seen} | found).items()
-        }
+        return {name: one * matched_scale(one, wanted) for name, one in ({"direct": seen} | found).items()}
 
     def figures(image: np.ndarray) -> LensPhotoScore:
         values: dict[str, float] = {}
@@ -200,11 +197,11 @@ def score_lens_photo(
     pictures = {f"object {object_name(which)}": wanted}
     for name, estimate in estimates(image).items():
         pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = estimate
-    variants = photo.with_more_noise(), photo.with_other_cameras()
-    freed, uncertainty = estimated(figures, figures(image), *variants)
+    noisy, variants = photo.with_more_noise(), photo.with_other_cameras()
+    corrected, sigma = corrected_scores(figures, figures(image), noisy, variants)
     return PhotoVerdict(
-        LensPhotoScore(**freed),
-        uncertainty,
+        LensPhotoScore(**corrected),
+        sigma,
         photo.record.model_copy(update={"imaged": which}),
         {name: picture.cpu().numpy() for name, picture in pictures.items()},
     )

@@ -18,7 +18,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.measurements import MeasuredSource, PhotoSource
-from litho_design.images.noise import estimated
+from litho_design.images.noise import corrected_scores
 from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import measured_print
@@ -35,7 +35,7 @@ from litho_design.tasks.design import Design
 class JudgedScore(Record):
     """The scores of a design from one judge, which is a model, a measured print or a photographed image.
 
-    ``uncertainty`` contains the standard deviation of each score. It is None if the judge is a model.
+    ``uncertainty`` contains σ of each score (see ``corrected_scores``). It is None if the judge is a model.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"stitching"})
@@ -190,13 +190,15 @@ def _print_score(
     """Score a predicted or measured print, and compare its height with the designed height. ``doubt_um`` is
     given for a measured print (see ``measured_print``).
     """
-    scored, spread = loaded.score(height), None
+    scored, sigma = loaded.score(height), None
     figures = scored.model_dump()
-    measured = doubt_um is not None
-    if isinstance(judge, MeasuredRecord) and doubt_um is not None:
-        pitch_um = loaded.record.layout.pitch_um
-        noisier, others = with_more_noise(height, judge), with_other_prints(height, judge, pitch_um)
-        figures, spread = estimated(loaded.score, scored, noisier, others, with_dust(height, doubt_um))
+    measured = isinstance(judge, MeasuredRecord)
+    if isinstance(judge, MeasuredRecord):
+        assert doubt_um is not None
+        noisy = with_more_noise(height, judge)
+        variants = with_other_prints(height, judge, loaded.record.layout.pitch_um)
+        dust = with_dust(height, doubt_um)
+        figures, sigma = corrected_scores(loaded.score, scored, noisy, variants, dust)
     off = (height - loaded.expected_um).double()
     in_rings = loaded.record.in_rings
     area = loaded.bench.propagator.ring_area_um2.to(off) if in_rings else torch.ones_like(off)
@@ -209,5 +211,5 @@ def _print_score(
         mean_height_difference_um=float((off * share).sum()),
         rms_height_difference_um=float((off.square() * share).sum().sqrt()),
         figures=figures,
-        uncertainty=spread,
+        uncertainty=sigma,
     )

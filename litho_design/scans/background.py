@@ -18,23 +18,24 @@ from litho_design.scans.shapes import amounts, legendre_shapes
 # spread of the heights must be at most ``_FLAT_UM``; otherwise, the substrate is not bare.
 _FOOT_UM, _BARE_SHARE, _FLAT_UM = 0.5, 0.3, 0.02
 # Roughness of a substrate is correlated, so this number of pixels counts as one independent height.
-_ALIKE_PX = 25
+_PIXELS_PER_HEIGHT = 25
 # Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
 # The deviation of a print from the expected print is larger in tilt and bow than in the orders above, by this
 # factor, which was found with ``benchmarks.coverage``.
-_LARGER = 2.0
+_LOW_ORDER_FACTOR = 2.0
 # Total orders of the polynomials that each kind of levelling removes.
 FITTED_ORDERS: dict[Levelling, tuple[int, ...]] = {"none": (), "plane": (1,), "bow": (1, 2)}
 # Number of groups into which the pixels are divided by their expected height.
-_HEIGHTS = 32
+_HEIGHT_GROUPS = 32
 
 
 @dataclass(frozen=True)
 class Background:
     """Tilt and bow of a scan. ``map_um`` is their sum, shape (ny, nx). The other fields are the slopes of the
-    tilt along x and y, the range of the bow, and the standard deviation of each term.
+    tilt along x and y, the range of the bow, and the standard deviation of each term (empty if they were
+    fitted to the print).
     """
 
     map_um: np.ndarray
@@ -87,7 +88,7 @@ def substrate_background(placed: Placed, pitch_um: float, levelling: Levelling) 
         bare[bare] = rest <= 4 * spread_um
     if spread_um > _FLAT_UM or min(side.mean() for side in sides) < _BARE_SHARE:
         return None
-    variances = np.diag(np.linalg.inv(seen.T @ seen))[1:] * _ALIKE_PX
+    variances = np.diag(np.linalg.inv(seen.T @ seen))[1:] * _PIXELS_PER_HEIGHT
     return Background.of(found[1:], shape, pitch_um, (spread_um * np.sqrt(variances)).tolist())
 
 
@@ -96,11 +97,12 @@ def print_terms_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:
     the print itself.
 
     It is extrapolated from finer terms of ``off_um``, the deviation from the expected print. First, the mean
-    deviation at each expected height is subtracted. The result is ``_LARGER`` times the rms of the terms of
-    orders 3 to 6 in the remaining map. Both maps have shape (ny, nx).
+    deviation at each expected height is subtracted. The result is ``_LOW_ORDER_FACTOR`` times the rms of the
+    terms of orders 3 to 6 in the remaining map. Both maps have shape (ny, nx).
     """
-    foreign = off_um.ravel().copy()
-    for places in np.array_split(np.argsort(expected_um, axis=None), _HEIGHTS):
-        foreign[places] -= foreign[places].mean()
-    finer = amounts(foreign.reshape(off_um.shape), legendre_shapes(off_um.shape, _ORDERS))
-    return _LARGER * float(np.sqrt(np.mean(finer**2)))
+    edges_um = np.quantile(expected_um, np.linspace(0, 1, _HEIGHT_GROUPS + 1)[1:-1])
+    group = np.searchsorted(edges_um, expected_um.ravel())
+    mean = np.bincount(group, off_um.ravel()) / np.bincount(group).clip(min=1)
+    foreign = off_um - mean[group].reshape(off_um.shape)
+    finer = amounts(foreign, legendre_shapes(off_um.shape, _ORDERS))
+    return _LOW_ORDER_FACTOR * float(np.sqrt(np.mean(finer**2)))

@@ -14,10 +14,11 @@ from litho_design.scans.background import FITTED_ORDERS
 from litho_design.scans.record import MeasuredRecord
 from litho_design.scans.shapes import amounts, legendre_shapes
 
-# All terms of a print's own tilt and bow may have one common relative error, whose standard deviation is
-# ``_COMMON_SD``. It was found with ``benchmarks.coverage``.
+# Tilt and bow of a print may all be wrong by one common factor. This is its standard deviation, found with
+# ``benchmarks.coverage``.
 _COMMON_SD = 0.1
-# Standard deviation of the height correction for the AFM tip, as a share of this correction.
+# Standard deviation of the height correction for the AFM tip, as a share of the change that a second
+# correction makes.
 _TIP_SD = 0.3
 
 
@@ -47,7 +48,7 @@ def with_other_prints(height_um: Tensor, record: MeasuredRecord, pitch_um: float
         narrower = paraboloid_erosion(measured, (pitch_um, pitch_um), record.tip_um).surface
         yield from _pair(_TIP_SD * (narrower - measured), height_um)
     removed = legendre_shapes(measured.shape, FITTED_ORDERS[record.levelling])
-    for shape, sd_um in zip(np.moveaxis(removed, -1, 0), record.removed_sd_um, strict=False):
+    for shape, sd_um in zip(np.moveaxis(removed, -1, 0), record.removed_sd_um, strict=True):
         yield from _pair(sd_um * shape, height_um)
     if removed.size and record.levelled_on == "print":
         yield from _pair(_COMMON_SD * removed @ amounts(measured - measured.mean(), removed), height_um)
@@ -58,7 +59,9 @@ def with_other_prints(height_um: Tensor, record: MeasuredRecord, pitch_um: float
 
 
 def with_dust(height_um: Tensor, doubt_um: Tensor) -> Iterator[Tensor]:
-    """Yield the print with and without ``doubt_um``, in µm, which may be print or dust, unless it is zero."""
+    """Yield the print with the doubtful height, µm, and the print without it. Yield nothing if no height is
+    doubtful.
+    """
     if doubt_um.any():
         yield from (height_um + doubt_um, height_um)
 
