@@ -116,8 +116,8 @@ def fitted_dark_level(photo: np.ndarray, expected: np.ndarray, fit: CameraFit) -
 
     way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
     seen: Any = cv2.warpPerspective(photo, fit.window_to_photo, expected.shape, **way)
-    # The blur is as wide as a mean over 3 × 3 camera pixels. The expected image must be averaged over the same
-    # area, because its dark gaps may be as narrow.
+    # The blur is as wide as a mean over 3 × 3 camera pixels. The expected image must be averaged over the
+    # same area, because its dark gaps may be as narrow.
     averaged_px = math.sqrt(2 / 3 / abs(np.linalg.det(fit.window_to_photo)))
     seen = cv2.GaussianBlur(seen, (0, 0), averaged_px)
     blurred = cv2.GaussianBlur(expected, (0, 0), math.hypot(averaged_px, max(fit.blur_px, 0.5)))
