@@ -103,13 +103,8 @@ class Closed:
         return [*self.named.causes, *self.lawful.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Return whether every other base model also needs the cause.
-
-        Base models with more parameters than the chosen base model are ignored, because their parameters may
-        have absorbed the cause.
-        """
-        most = self.plain.twin.own
-        return all(name in cause.survives_on for name, one in self.rivals.items() if one.twin.own <= most)
+        """Return whether every other base model also needs the cause."""
+        return {*self.rivals} <= {*cause.survives_on}
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:

@@ -191,8 +191,8 @@ class Planted(Record):
     after the free terms of each scan have been fitted to this change and subtracted. If the planted effect is
     a cause that the loop found, or looks the same as such a cause, ``named`` lists this cause and all effects
     that look the same. Otherwise, ``named`` is empty. A cause counts only if all other base models also need
-    it; base models with more parameters are ignored. ``found`` is the fitted strength of the planted effect,
-    or None if this effect is not in the corrected model.
+    it. ``found`` is the fitted strength of the planted effect, or None if this effect is not in the corrected
+    model.
     """
 
     name: str
