@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_design.images.camera_pose import Images, blurred_images, tilted_pose
+from litho_design.images.camera_pose import Images, blurred_images, resampled, tilted_pose
 
 # Another printer moves the whole image of a hologram, which the scatter between the tiles of a photograph
 # does not show. These are typical standard deviations of the shifts, the rotation, the scale and the tilts,
@@ -114,8 +114,7 @@ def fitted_dark_level(photo: np.ndarray, expected: np.ndarray, fit: CameraFit) -
     """
     import cv2
 
-    way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-    seen: Any = cv2.warpPerspective(photo, fit.window_to_photo, expected.shape, **way)
+    seen: Any = resampled(photo, fit.window_to_photo, len(expected))
     # The blur is as wide as a mean over 3 × 3 camera pixels. The expected image must be averaged over the
     # same area, because its dark gaps may be as narrow.
     averaged_px = math.sqrt(2 / 3 / abs(np.linalg.det(fit.window_to_photo)))

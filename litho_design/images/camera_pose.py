@@ -60,13 +60,7 @@ class Images:
 
     def seen(self, pose: np.ndarray) -> np.ndarray:
         """Resample the photograph on the pixels of the window, shape (m, m)."""
-        import cv2
-
-        found: np.ndarray = cv2.warpPerspective(
-            self.photo, self.warp(pose), self.expected.shape, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
-        return found.astype(np.float64)
+        return resampled(self.photo, self.warp(pose), len(self.expected)).astype(np.float64)
 
     def correlation(self, pose: np.ndarray) -> float:
         return float(np.corrcoef(self.seen(pose).ravel(), self.expected.ravel())[0, 1])
@@ -108,6 +102,17 @@ class Pose(NamedTuple):
     pose: np.ndarray
     free: list[int]
     scatter_px2: np.ndarray
+
+
+def resampled(photo: np.ndarray, warp: np.ndarray, side: int, *, sharp: bool = False) -> np.ndarray:
+    """Interpolate a photograph at the pixels of the window, shape (side, side). ``sharp`` keeps fine detail.
+    ``warp`` maps window pixels to photograph pixels.
+    """
+    import cv2
+
+    kind = cv2.INTER_LANCZOS4 if sharp else cv2.INTER_LINEAR
+    way: Any = {"flags": kind | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+    return cv2.warpPerspective(photo, warp, (side, side), **way)
 
 
 def blurred_images(photo: Any, expected: Any, scale: float) -> Images:

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.results import Record
 from litho_design.images.camera_fit import inside_photograph
+from litho_design.images.camera_pose import resampled
 from litho_design.images.noise import DRAWS
 from litho_design.images.targets import ImagedObject
 
 # Limit of |log(gamma)| above which a remark is made. The counts are proportional to light^gamma. Even for
 # prints close to the expected one, the fitted gamma lies between 0.9 and 1.1, not exactly at 1.
 _OPEN_GAMMA_OFF = 0.1
+# Standard deviation of the unknown part of a photograph's blur, as a share of the whole blur.
+_BLUR_SD = 0.2
 
 
 class CameraRecord(Record):
@@ -145,8 +148,8 @@ class Photograph:
 
     def with_other_cameras(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one property of the camera differs by plus and minus its standard
-        deviation. The properties are the independent movements of the camera and, unless they are known, the
-        vignetting and the dark level.
+        deviation. The properties are the independent movements of the camera, its blur and, unless they are
+        known, the vignetting and the dark level.
         """
         yield from (self._warped(self.counts, warp) for pair in self.other_warps for warp in pair)
         for sign in (1, -1) if self.record.vignetting_sd else ():
@@ -154,6 +157,9 @@ class Photograph:
         for sign in (1, -1) if self.record.dark_level_sd else ():
             darker = self.counts - np.float32(sign * self.record.dark_level_sd)
             yield self._warped(darker, self.window_to_photo)
+        # If the photograph is blurrier than the expected image, the cause may be the camera or the print.
+        blurred = gaussian_filter(self.expected, self.record.blur_um / self.pitch_um) - self.expected
+        yield from (self.image() + sign * _BLUR_SD * blurred for sign in (1, -1))
 
     def _camera_pixels(self, warp: np.ndarray) -> float:
         """Return the number of camera pixels per window pixel in the middle of the window."""
@@ -161,13 +167,11 @@ class Photograph:
         return float(abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3))
 
     def _warped(self, counts: np.ndarray, warp: np.ndarray, vignetting: float = 0.0) -> np.ndarray:
-        import cv2
         from scipy.fft import dctn, idctn
 
         side = self.side_px
         flat = counts / (1 - vignetting * _radius_squared(counts.shape))
-        way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-        found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
+        found = resampled(flat.astype(np.float32), warp, side, sharp=True)
         # With the map ``warp``, a window pixel collects the light of more or fewer camera pixels than with
         # the fitted map.
         found = found * (self._camera_pixels(warp) / self._camera_pixels(self.window_to_photo))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import torch
 from pydantic import Field
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError, unknown_name
@@ -29,8 +27,6 @@ from litho_design.optics.imaging import Blur, richardson_lucy
 
 # Largest accepted σ of the SI-PSNR, in dB. With a larger σ, a score cannot decide between designs.
 _LARGEST_SD_DB = 0.5
-# Standard deviation of the unknown part of a photograph's blur, as a share of the whole blur.
-_BLUR_SD = 0.2
 
 
 class PhotoScore(Record):
@@ -108,12 +104,8 @@ def score_hologram_photo(
         return photo_score(share, target, resolved, has_power=power is not None)
 
     image = photo.image()
-    # If the photograph is blurrier than the expected image, the cause may be the camera or the print. The
-    # photograph may therefore be a little sharper or blurrier than it should be.
-    blur_px = photo.record.blur_um / loaded.record.layout.pitch_um
-    blurred = _BLUR_SD * (gaussian_filter(photo.expected, blur_px) - photo.expected)
-    variants = chain(photo.with_other_cameras(), (image + blurred, image - blurred))
-    corrected, sigma = corrected_scores(figures, figures(image), photo.with_more_noise(), variants)
+    noisy, variants = photo.with_more_noise(), photo.with_other_cameras()
+    corrected, sigma = corrected_scores(figures, figures(image), noisy, variants)
     if not sigma["si_psnr_db"] <= _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
