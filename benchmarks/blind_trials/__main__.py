@@ -28,7 +28,7 @@ from litho_models.boards.figures import figure_lines, make_scoreboard, trial_tab
 from litho_models.boards.records import Board
 
 # The seed of each board was announced before any of its trials was run. Other seeds are used for development.
-ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20282}
+ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20283}
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 
